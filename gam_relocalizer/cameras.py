@@ -100,9 +100,7 @@ def camera_from_calibration(
             f"CameraInfo with a calibration (camera_calibration, or the driver's own)"
         )
         raise CameraError(msg)
-    model, distortion = (
-        ('PINHOLE', []) if image_is_rectified else _distortion(calibration)
-    )
+    model, distortion = ('PINHOLE', []) if image_is_rectified else _distortion(calibration)
     x_offset, y_offset, roi_width, roi_height = calibration.roi
     if not (roi_width and roi_height):
         x_offset, y_offset = 0, 0

@@ -103,11 +103,13 @@ def read_poses(path: Path) -> dict[str, pycolmap.Rigid3d]:
 def write_poses(path: Path, poses: Mapping[str, pycolmap.Rigid3d]) -> None:
     """Writes lines `name qw qx qy qz tx ty tz` (the long-term visual localization benchmark's)."""
     lines = [
-        ' '.join([
-            name,
-            *(f'{value:.12g}' for value in quaternion_wxyz(transform)),
-            *(f'{value:.12g}' for value in transform.translation),
-        ])
+        ' '.join(
+            [
+                name,
+                *(f'{value:.12g}' for value in quaternion_wxyz(transform)),
+                *(f'{value:.12g}' for value in transform.translation),
+            ]
+        )
         for name, transform in poses.items()
     ]
     write_text(path, ''.join(f'{line}\n' for line in lines))

@@ -49,6 +49,15 @@ FORMAT_VERSION = 1
 MANIFEST = 'manifest.yaml'
 IMAGES = 'images.txt'
 SFM = 'sfm'
+RUN_TIME_FILES = (
+    IMAGES,
+    'points.npy',
+    'descriptors.npy',
+    'observation_offsets.npy',
+    'observation_points.npy',
+    'global.npy',
+    'codebook.npy',
+)
 MAX_MANIFEST_BYTES = 16 * 2**20
 _HASH_BLOCK = 2**20
 
@@ -266,12 +275,8 @@ def load_map(path: Path) -> SceneMap:
         descriptors=_read_array(
             path / 'descriptors.npy', np.float16, (points, dimension), mapped=True
         ),
-        observation_offsets=_read_array(
-            path / 'observation_offsets.npy', np.int64, (images + 1,)
-        ),
-        observation_points=_read_array(
-            path / 'observation_points.npy', np.int32, (observations,)
-        ),
+        observation_offsets=_read_array(path / 'observation_offsets.npy', np.int64, (images + 1,)),
+        observation_points=_read_array(path / 'observation_points.npy', np.int32, (observations,)),
         global_descriptors=_read_array(path / 'global.npy', np.float32, (images, None)),
         codebook=_read_array(path / 'codebook.npy', np.float32, (None, dimension)),
     )
@@ -306,7 +311,7 @@ def read_manifest(path: Path) -> Manifest:
         raise MapError(msg)
     try:
         return _manifest_from(data)
-    except (KeyError, TypeError, ValueError) as err:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as err:
         msg = f'{file}: incomplete or malformed: {err!r}; rebuild the map with `map build`'
         raise MapError(msg) from err
 
@@ -395,6 +400,10 @@ def _manifest_from(data: Mapping[str, Any]) -> Manifest:
         str(name): FileEntry(int(entry['size']), str(entry['sha256']))
         for name, entry in data['files'].items()
     }
+    missing = [name for name in RUN_TIME_FILES if name not in files]
+    if missing:
+        msg = f'files that are not listed, so that nothing vouches for them: {missing}'
+        raise ValueError(msg)
     outside = [name for name in files if Path(name).is_absolute() or '..' in Path(name).parts]
     if outside:
         msg = f'file names that leave the bundle: {outside}'
@@ -422,9 +431,7 @@ def _frame_from(frame: Mapping[str, Any]) -> MapFrame:
     return MapFrame(scale, (w, x, y, z), (tx, ty, tz), bool(frame['metric']), str(frame['source']))
 
 
-def _read_images(
-    file: Path, count: int
-) -> tuple[tuple[str, ...], tuple[pycolmap.Rigid3d, ...]]:
+def _read_images(file: Path, count: int) -> tuple[tuple[str, ...], tuple[pycolmap.Rigid3d, ...]]:
     try:
         poses = read_poses(file)
     except PosesFileError as err:
@@ -444,9 +451,8 @@ def _read_array(
 ) -> NDArray[Any]:
     """Loads one array; `None` in the shape stands for any size."""
     try:
-        array: NDArray[Any] = np.load(
-            file, mmap_mode='r' if mapped else None, allow_pickle=False
-        )
+        # Mapped in any case: a header may claim more numbers than there is memory.
+        array: NDArray[Any] = np.load(file, mmap_mode='r', allow_pickle=False)
     except (OSError, ValueError, EOFError) as err:
         msg = f'{file}: cannot be read as a NumPy array: {err}'
         raise MapError(msg) from err
@@ -457,15 +463,17 @@ def _read_array(
         expected = f'{np.dtype(dtype).name} {tuple("any" if n is None else n for n in shape)}'
         msg = f'{file}: expected {expected}, found {array.dtype.name} {array.shape}'
         raise MapError(msg)
-    if not mapped and array.dtype.kind == 'f' and not np.isfinite(array).all():
+    if mapped:
+        return array
+    if array.dtype.kind == 'f' and not np.isfinite(array).all():
         msg = f'{file}: holds numbers that are not finite'
         raise MapError(msg)
-    return array
+    return np.array(array)
 
 
 def _check_observations(scene_map: SceneMap) -> None:
     offsets, seen = scene_map.observation_offsets, scene_map.observation_points
-    if offsets[0] != 0 or offsets[-1] != len(seen) or (np.diff(offsets) < 0).any():
+    if offsets[0] != 0 or offsets[-1] != len(seen) or (offsets[1:] < offsets[:-1]).any():
         msg = (
             f'{scene_map.path / "observation_offsets.npy"}: offsets must rise from 0 to '
             f'{len(seen)}, found {offsets[0]} to {offsets[-1]}'
