@@ -1,0 +1,68 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""What a replay comes back with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pycolmap
+    from numpy.typing import NDArray
+
+    from gam_relocalizer.localization.result import LocalizationResult, PoseEstimate
+    from gam_relocalizer.localization.robot_pose import RobotPose
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One query of the replay.
+
+    Attributes:
+        stamp_ns: Stamp of the image [ns].
+        result: What the localizer said.
+        robot_pose: The body's pose, when accepted.
+        truth: map_from_base at that time, when the bag tells.
+    """
+
+    stamp_ns: int
+    result: LocalizationResult
+    robot_pose: RobotPose | None = None
+    truth: pycolmap.Rigid3d | None = None
+
+
+@dataclass(frozen=True)
+class Illustration:
+    """An image with the pose found for it, for a picture of its matches.
+
+    Attributes:
+        stamp_ns: Stamp of the image [ns].
+        image: RGB [H,W,3] or grey [H,W].
+        camera: The camera that took it.
+        estimate: The pose, with its inliers.
+    """
+
+    stamp_ns: int
+    image: NDArray[np.uint8]
+    camera: pycolmap.Camera
+    estimate: PoseEstimate
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The outcome of a replay.
+
+    Attributes:
+        attempts: In the order of their stamps, which strictly increase.
+        image_topic: Where the images came from.
+        images: Number of images there.
+        illustrations: The accepted images with the most and the fewest inliers, in this order;
+            one when they are the same, none when nothing was accepted.
+    """
+
+    attempts: tuple[Attempt, ...]
+    image_topic: str
+    images: int
+    illustrations: tuple[Illustration, ...]
