@@ -1,0 +1,187 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""BMNet: the probability of every candidate match, from geometry alone.
+
+Section 'Network Architecture' of the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+if TYPE_CHECKING:
+    import pycolmap
+    from numpy.typing import NDArray
+
+NORM_EPSILON = 1e-3
+FAR_DISTANCE = 10.0
+
+
+@dataclass(frozen=True)
+class BMNetConfig:
+    """Size of the network; the default is the published one with two perceptrons per block.
+
+    Attributes:
+        point_blocks: Blocks of U-Net and of V-Net (L_p), 32, 64, `point_width`, ... wide.
+        edge_blocks: Blocks of E-Net (L_e).
+        point_width: Features per keypoint and per point; an edge has twice as many.
+        perceptrons: Perceptrons in a block.
+    """
+
+    point_blocks: int = 5
+    edge_blocks: int = 18
+    point_width: int = 128
+    perceptrons: int = 2
+
+
+class ContextNorm(nn.Module):
+    """Normalise every feature over the set, then scale and shift.
+
+    Each graph by itself. Batch normalisation repeats this with one graph per batch: it is both.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(width))
+        self.shift = nn.Parameter(torch.zeros(width))
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """[S, B, width] -> the same, normalised over S; a set of one becomes the shift alone."""
+        size, batch, width = features.shape
+        if size < 2:
+            return torch.zeros_like(features) * self.scale + self.shift
+        # every graph of the batch gets features of its own, so one call serves all of them
+        normal = functional.batch_norm(
+            features.reshape(size, batch * width),
+            None,
+            None,
+            self.scale.repeat(batch),
+            self.shift.repeat(batch),
+            training=True,
+            eps=NORM_EPSILON,
+        )
+        return normal.view(size, batch, width)
+
+
+class Block(nn.Module):
+    """Perceptrons (norm, ReLU, linear without bias) with a shortcut around them."""
+
+    def __init__(self, width_in: int, width_out: int, perceptrons: int) -> None:
+        super().__init__()
+        widths = [width_in] + [width_out] * perceptrons
+        self.norms = nn.ModuleList(ContextNorm(width) for width in widths[:-1])
+        self.linears = nn.ModuleList(
+            nn.Linear(width, width_out, bias=False) for width in widths[:-1]
+        )
+        same = width_in == width_out
+        self.shortcut = nn.Identity() if same else nn.Linear(width_in, width_out, bias=False)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """[S, B, width_in] -> [S, B, width_out]."""
+        hidden = features
+        for norm, linear in zip(self.norms, self.linears, strict=True):
+            hidden = linear(functional.relu(norm(hidden)))
+        shortcut: torch.Tensor = self.shortcut(features)
+        return shortcut + hidden
+
+
+class BMNet(nn.Module):
+    """U-Net on keypoints, V-Net on points, E-Net on the edges between them."""
+
+    def __init__(self, config: BMNetConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or BMNetConfig()
+        self.keypoint_net = _point_net(2, self.config)
+        self.point_net = _point_net(3, self.config)
+        width = 2 * self.config.point_width
+        self.edge_net = nn.Sequential(
+            *(Block(width, width, self.config.perceptrons) for _ in range(self.config.edge_blocks)),
+            ContextNorm(width),
+            nn.ReLU(),
+            nn.Linear(width, 1),
+        )
+
+    def forward(
+        self, keypoints: torch.Tensor, points: torch.Tensor, edges: torch.Tensor
+    ) -> torch.Tensor:
+        """Score the edges of graphs of equal size.
+
+        Args:
+            keypoints: [M, B, 2] normalised keypoints that have an edge.
+            points: [N, B, 3] normalised points that have an edge.
+            edges: [T, B, 2] int64 (keypoint, point).
+
+        Returns:
+            [T, B] logits; their sigmoid is the probability that an edge is a true match.
+        """
+        graph = torch.arange(edges.shape[1])
+        of_keypoints = _embed(self.keypoint_net, keypoints)[edges[..., 0], graph]
+        of_points = _embed(self.point_net, points)[edges[..., 1], graph]
+        logits: torch.Tensor = self.edge_net(torch.cat([of_keypoints, of_points], dim=2))
+        return logits[..., 0].float()
+
+
+def _embed(net: nn.Sequential, coordinates: torch.Tensor) -> torch.Tensor:
+    # bfloat16, where training uses it, is too coarse for coordinates
+    with torch.autocast(coordinates.device.type, enabled=False):
+        features = net[0](coordinates)
+    embedded: torch.Tensor = net[1:](features)
+    return embedded
+
+
+def _point_net(dimensions: int, config: BMNetConfig) -> nn.Sequential:
+    widening = [32, 64][: config.point_blocks - 1]
+    constant = [config.point_width] * (config.point_blocks - len(widening))
+    widths = [dimensions, *widening, *constant]
+    return nn.Sequential(*(Block(a, b, config.perceptrons) for a, b in pairwise(widths)))
+
+
+def normalise_keypoints(
+    keypoints: NDArray[np.floating], camera: pycolmap.Camera
+) -> NDArray[np.float32]:
+    """Undistort keypoints and scale them to the size of the image.
+
+    For a pinhole with a central principal point this is (x - size / 2) / (1.2 * longer side), as
+    published; distortion and an offset principal point are taken out first.
+
+    Args:
+        keypoints: [M, 2] pixels, COLMAP convention.
+        camera: Camera that took the image.
+
+    Returns:
+        [M, 2]; not finite where the camera model cannot undistort a keypoint.
+    """
+    if not len(keypoints):
+        return np.empty((0, 2), np.float32)
+    on_plane = camera.cam_from_img(np.asarray(keypoints, np.float64))
+    scale = camera.mean_focal_length() / (1.2 * max(camera.width, camera.height))
+    return np.asarray(on_plane, np.float32).reshape(-1, 2) * np.float32(scale)
+
+
+def normalise_points(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Scale the points of a scene, whatever its unit and however wild a few of them.
+
+    The unit is the median distance from the origin: it does not move when a minority of the
+    triangulated points lies far away, as range and mean do. Points more than 10 units out keep
+    their direction only, so that no single one dominates the context norm. The origin stays, for
+    it is where the reference camera stands.
+
+    Args:
+        points: [N, 3] finite points in the frame of a camera that looks at them, any unit.
+
+    Returns:
+        [N, 3] without unit.
+    """
+    if not len(points):
+        return np.empty((0, 3), np.float32)
+    distances = np.linalg.norm(np.asarray(points, np.float64), axis=1)
+    unit = float(np.median(distances)) or float(distances.max()) or 1.0
+    shrink = unit * np.maximum(1.0, distances / (FAR_DISTANCE * unit))
+    return np.asarray(points / shrink[:, None], np.float32)
