@@ -258,9 +258,7 @@ def test_rejects_names_that_leave_the_bundle(bundle: Path, name: str) -> None:
         lambda manifest: manifest['extractor'].update(dimension='many'),
     ],
 )
-def test_rejects_a_malformed_manifest(
-    bundle: Path, edit: Callable[[dict[str, Any]], None]
-) -> None:
+def test_rejects_a_malformed_manifest(bundle: Path, edit: Callable[[dict[str, Any]], None]) -> None:
     edit_manifest(bundle, edit)
 
     with pytest.raises(MapError, match=MANIFEST):

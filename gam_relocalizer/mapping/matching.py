@@ -1,0 +1,80 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""Matching the local features of two images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_BLOCK = 4096
+
+
+def mutual_nearest_neighbours(
+    first: NDArray[np.float32],
+    second: NDArray[np.float32],
+    min_similarity: float,
+    max_ratio: float,
+) -> NDArray[np.int64]:
+    """Pairs of descriptors that are each other's nearest, near enough and distinctive.
+
+    Args:
+        first: [A,D], L2-normalised.
+        second: [B,D], L2-normalised.
+        min_similarity: Least cosine of a pair.
+        max_ratio: Greatest distance to the nearest, relative to the second nearest (Lowe, 2004),
+            seen from both sides; 1 lets everything pass.
+
+    Returns:
+        [K,2] indices into first and second, rising in the first column.
+    """
+    if not len(first) or not len(second):
+        return np.zeros((0, 2), dtype=np.int64)
+    forth = _nearest(torch.from_numpy(first), torch.from_numpy(second), max_ratio)
+    back = _nearest(torch.from_numpy(second), torch.from_numpy(first), max_ratio)
+    rows = np.arange(len(first))
+    kept = (
+        (back.indices[forth.indices] == rows)
+        & (forth.similarities >= min_similarity)
+        & forth.distinctive
+        & back.distinctive[forth.indices]
+    )
+    return np.stack([rows[kept], forth.indices[kept]], axis=1)
+
+
+@dataclass(frozen=True)
+class _Nearest:
+    """The nearest reference of each query, and whether the second nearest is clearly farther."""
+
+    indices: NDArray[np.int64]
+    similarities: NDArray[np.float32]
+    distinctive: NDArray[np.bool_]
+
+
+def _nearest(queries: torch.Tensor, references: torch.Tensor, max_ratio: float) -> _Nearest:
+    blocks = [
+        _nearest_in_block(block @ references.T, max_ratio) for block in torch.split(queries, _BLOCK)
+    ]
+    indices, similarities, distinctive = (
+        torch.cat(parts).numpy() for parts in zip(*blocks, strict=True)
+    )
+    return _Nearest(indices, similarities, distinctive)
+
+
+def _nearest_in_block(
+    similarity: torch.Tensor, max_ratio: float
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Index, cosine and distinctiveness of the largest entry of each row; overwrites its input."""
+    nearest = similarity.max(dim=1)
+    # Twice the largest is several times faster than torch.topk.
+    similarity.scatter_(1, nearest.indices[:, None], -1.0)
+    second = similarity.max(dim=1).values
+    # Squared distances of unit vectors are 2 - 2 cos.
+    distinctive = 1.0 - nearest.values <= max_ratio**2 * (1.0 - second)
+    return nearest.indices, nearest.values, distinctive

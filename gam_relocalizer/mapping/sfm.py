@@ -1,0 +1,216 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""Structure from motion with pycolmap: database, geometric verification, mapping, triangulation."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from gam_relocalizer.mapping.extraction import MappingImage
+    from gam_relocalizer.mapping.intrinsics import ImageCameras
+    from gam_relocalizer.mapping.progress import Progress
+
+MIN_IMAGES = 3
+_SEED = 0
+# Bundle adjustment sums in the order of its threads: with more than one, no two maps are alike.
+_THREADS = 1
+# Mutual neighbours that are forced into one geometry always yield some inliers. Pairs below these
+# were false nine times out of ten in a courtyard of repeated windows.
+_MIN_INLIERS = 30
+_MIN_INLIER_RATIO = 0.3
+_MAX_TRIALS = 2000
+
+
+@dataclass(frozen=True)
+class SfmInput:
+    """Everything that structure from motion starts from.
+
+    Attributes:
+        images: Image i has COLMAP's id i + 1.
+        cameras: Of these images.
+        camera_is_known: Whether intrinsics are kept as they are.
+        matches: (first, second) image index to [K,2] keypoint indices.
+    """
+
+    images: Sequence[MappingImage]
+    cameras: ImageCameras
+    camera_is_known: bool
+    matches: Mapping[tuple[int, int], NDArray[np.int64]]
+
+
+def image_id_of(index: int) -> int:
+    """COLMAP's id of an image; ids start at 1."""
+    return index + 1
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """Keeps COLMAP's own log off the terminal."""
+    level, threshold = pycolmap.logging.minloglevel, pycolmap.logging.stderrthreshold
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+    pycolmap.logging.stderrthreshold = pycolmap.logging.Level.FATAL.value
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel, pycolmap.logging.stderrthreshold = level, threshold
+
+
+def write_database(path: Path, sfm_input: SfmInput) -> None:
+    """Writes cameras, images, keypoints and raw matches to a new COLMAP database."""
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera in sfm_input.cameras.cameras:
+            database.write_camera(camera, use_camera_id=True)
+            database.write_rig(_trivial_rig(camera), use_rig_id=True)
+        for index, image in enumerate(sfm_input.images):
+            _write_image(database, index, image, sfm_input)
+        for (first, second), matches in sfm_input.matches.items():
+            database.write_matches(
+                image_id_of(first), image_id_of(second), matches.astype(np.uint32)
+            )
+
+
+def verify_geometry(database_path: Path) -> int:
+    """Keeps matches that agree with one epipolar geometry or homography.
+
+    Returns:
+        Number of image pairs that hold.
+    """
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = _SEED
+    options.ransac.max_num_trials = _MAX_TRIALS
+    options.min_num_inliers = _MIN_INLIERS
+    options.min_inlier_ratio = _MIN_INLIER_RATIO
+    options.compute_relative_pose = True
+    pycolmap.geometric_verification(database_path, two_view_geometry_options=options)
+    with pycolmap.Database.open(database_path) as database:
+        _, geometries = database.read_two_view_geometries()
+    return sum(len(geometry.inlier_matches) > 0 for geometry in geometries)
+
+
+def map_images(
+    database_path: Path, work: Path, sfm_input: SfmInput, mapper: str, progress: Progress
+) -> list[pycolmap.Reconstruction]:
+    """Recovers poses and points; the model of most images comes first.
+
+    Args:
+        database_path: With verified matches.
+        work: Folder for intermediate files.
+        sfm_input: What the database was made of.
+        mapper: `incremental` or `global`.
+        progress: Told of every registered image.
+    """
+    pycolmap.set_random_seed(_SEED)
+    if mapper == 'global':
+        models = _map_globally(database_path, work, sfm_input)
+    else:
+        models = _map_incrementally(database_path, work, sfm_input, progress)
+    return sorted(models, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+
+def triangulate(
+    database_path: Path,
+    work: Path,
+    sfm_input: SfmInput,
+    camera_from_world: Sequence[pycolmap.Rigid3d],
+) -> pycolmap.Reconstruction:
+    """Points from images with known poses; the model lies in the frame and scale of the poses."""
+    pycolmap.set_random_seed(_SEED)
+    model = pycolmap.Reconstruction()
+    for camera in sfm_input.cameras.cameras:
+        model.add_camera_with_trivial_rig(camera)
+    for index, image in enumerate(sfm_input.images):
+        model.add_image_with_trivial_frame(
+            _colmap_image(index, image, sfm_input), camera_from_world[index]
+        )
+    options = pycolmap.IncrementalPipelineOptions()
+    _set_incremental_options(options, sfm_input)
+    return pycolmap.triangulate_points(
+        model,
+        database_path,
+        work,
+        work,
+        options=options,
+        refine_intrinsics=not sfm_input.camera_is_known,
+    )
+
+
+def _map_incrementally(
+    database_path: Path, work: Path, sfm_input: SfmInput, progress: Progress
+) -> list[pycolmap.Reconstruction]:
+    options = pycolmap.IncrementalPipelineOptions()
+    _set_incremental_options(options, sfm_input)
+    total, registered = len(sfm_input.images), 0
+
+    def count_image() -> None:
+        nonlocal registered
+        registered = min(registered + 1, total)
+        progress('sfm', registered, total)
+
+    models = pycolmap.incremental_mapping(
+        database_path, work, work, options=options, next_image_callback=count_image
+    )
+    return list(models.values())
+
+
+def _map_globally(
+    database_path: Path, work: Path, sfm_input: SfmInput
+) -> list[pycolmap.Reconstruction]:
+    if not sfm_input.camera_is_known:
+        calibration = pycolmap.ViewGraphCalibrationOptions()
+        calibration.random_seed = _SEED
+        pycolmap.calibrate_view_graph(database_path, calibration)
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = options.mapper.random_seed = _SEED
+    options.num_threads = options.mapper.num_threads = _THREADS
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = not sfm_input.camera_is_known
+    adjustment.refine_extra_params = not sfm_input.camera_is_known
+    return list(pycolmap.global_mapping(database_path, work, work, options).values())
+
+
+def _set_incremental_options(
+    options: pycolmap.IncrementalPipelineOptions, sfm_input: SfmInput
+) -> None:
+    options.random_seed = _SEED
+    options.num_threads = _THREADS
+    options.min_model_size = MIN_IMAGES
+    options.extract_colors = False
+    if sfm_input.camera_is_known:
+        options.constant_cameras = {camera.camera_id for camera in sfm_input.cameras.cameras}
+
+
+def _write_image(
+    database: pycolmap.Database, index: int, image: MappingImage, sfm_input: SfmInput
+) -> None:
+    colmap_image = _colmap_image(index, image, sfm_input)
+    database.write_image(colmap_image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=image_id_of(index), rig_id=colmap_image.camera_id)
+    frame.add_data_id(colmap_image.data_id)
+    database.write_frame(frame, use_frame_id=True)
+    database.write_keypoints(image_id_of(index), image.features.keypoints)
+
+
+def _colmap_image(index: int, image: MappingImage, sfm_input: SfmInput) -> pycolmap.Image:
+    return pycolmap.Image(
+        name=image.name,
+        keypoints=image.features.keypoints.astype(np.float64),
+        camera_id=sfm_input.cameras.cameras[sfm_input.cameras.of_image[index]].camera_id,
+        image_id=image_id_of(index),
+    )
+
+
+def _trivial_rig(camera: pycolmap.Camera) -> pycolmap.Rig:
+    rig = pycolmap.Rig(rig_id=camera.camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    return rig
