@@ -1,0 +1,255 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""The whole query on a made-up place: accuracy, statuses for hopeless input, determinism."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from synthetic_place import (
+    CAMERA,
+    IDENTITY,
+    Place,
+    ViewExtractor,
+    features_of,
+    image_of,
+    no_features,
+    query_pose,
+    save_place,
+)
+
+from gam_relocalizer.errors import MapError
+from gam_relocalizer.geometry import pose_error
+from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
+from gam_relocalizer.localization.result import LocalizationResult, Status
+from gam_relocalizer.localization.verdict import VerdictOptions
+from gam_relocalizer.matching.baselines import NearestNeighbourRatio
+from gam_relocalizer.scene_map import MapFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from gam_relocalizer.features.local import LocalFeatures
+    from gam_relocalizer.scene_map import SceneMap
+
+PLACE = Place()
+FISHEYE = pycolmap.Camera(
+    camera_id=1,
+    model='OPENCV_FISHEYE',
+    width=800,
+    height=600,
+    params=[300, 300, 400, 300, -0.02, 0.01, 0.0, 0.0],
+)
+DISTORTED = pycolmap.Camera(
+    camera_id=1,
+    model='OPENCV',
+    width=800,
+    height=600,
+    params=[600, 600, 400, 300, -0.2, 0.05, 0.001, -0.001],
+)
+
+
+@pytest.fixture(scope='module')
+def scene_map(tmp_path_factory: pytest.TempPathFactory) -> SceneMap:
+    return save_place(tmp_path_factory.mktemp('maps') / 'place', PLACE)
+
+
+def make_localizer(
+    scene_map: SceneMap,
+    views: Mapping[int, LocalFeatures],
+    options: LocalizerOptions | None = None,
+) -> Localizer:
+    return Localizer(scene_map, ViewExtractor(dict(views)), NearestNeighbourRatio(), options)
+
+
+def localize(scene_map: SceneMap, features: LocalFeatures, **options: object) -> LocalizationResult:
+    localizer = make_localizer(scene_map, {0: features}, LocalizerOptions(**options))
+    return localizer.localize(image_of(0), CAMERA)
+
+
+def check_invariants(result: LocalizationResult) -> None:
+    assert result.reason
+    assert result.keypoints >= result.matches >= result.inliers >= 0
+    assert result.timings.total >= 0.0
+    if result.accepted:
+        assert result.estimate is not None
+    if result.estimate is not None:
+        covariance = result.estimate.covariance
+        assert (covariance == covariance.T).all()
+        np.linalg.cholesky(covariance)
+        assert len(result.estimate.inlier_keypoints) == result.inliers
+        assert len(set(result.estimate.inlier_points.tolist())) == result.inliers
+        assert 0.0 < result.estimate.coverage <= 1.0
+        assert result.estimate.inlier_ratio == pytest.approx(result.inliers / result.matches)
+
+
+@pytest.mark.parametrize('camera', [CAMERA, DISTORTED, FISHEYE], ids=lambda c: c.model_name)
+def test_localizes_queries_near_the_truth(scene_map: SceneMap, camera: pycolmap.Camera) -> None:
+    views = {i: features_of(PLACE, query_pose(i), seed=i, camera=camera) for i in range(10)}
+    localizer = make_localizer(scene_map, views)
+    for index in views:
+        result = localizer.localize(image_of(index, camera), camera)
+        check_invariants(result)
+        assert result.accepted
+        error = pose_error(result.estimate.camera_from_map, query_pose(index))
+        assert error.position < 0.05
+        assert error.rotation_deg < 0.5
+
+
+def test_answers_in_the_frame_of_the_map(tmp_path_factory: pytest.TempPathFactory) -> None:
+    frame = MapFrame(2.5, (0.5, 0.5, -0.5, 0.5), (10.0, -20.0, 3.0), metric=True, source='survey')
+    framed = save_place(tmp_path_factory.mktemp('maps') / 'framed', PLACE, frame)
+    result = localize(framed, features_of(PLACE, query_pose(0), seed=0))
+    truth = frame.map_from_sfm.transform_camera_world(query_pose(0))
+    assert result.accepted
+    assert pose_error(result.estimate.camera_from_map, truth).position < 0.1
+    assert pose_error(result.estimate.camera_from_map, truth).rotation_deg < 0.5
+
+
+def test_same_image_gives_the_same_bytes(scene_map: SceneMap) -> None:
+    features = features_of(PLACE, query_pose(1), seed=1, clutter=500)
+    first, second = (localize(scene_map, features) for _ in range(2))
+    assert first.estimate.camera_from_map.matrix().tobytes() == (
+        second.estimate.camera_from_map.matrix().tobytes()
+    )
+    assert first.estimate.covariance.tobytes() == second.estimate.covariance.tobytes()
+    assert replace(first, estimate=None, timings=None) == (
+        replace(second, estimate=None, timings=None)
+    )
+
+
+def test_image_without_features_is_refused(scene_map: SceneMap) -> None:
+    result = localize(scene_map, no_features())
+    assert result.status is Status.TOO_FEW_FEATURES
+    assert result.estimate is None
+
+
+def test_another_place_is_refused(scene_map: SceneMap) -> None:
+    elsewhere = Place(seed=77)
+    for index in range(10):
+        result = localize(scene_map, features_of(elsewhere, query_pose(index), seed=index))
+        check_invariants(result)
+        assert not result.accepted
+
+
+def test_mirrored_image_is_refused(scene_map: SceneMap) -> None:
+    for index in range(5):
+        features = features_of(PLACE, query_pose(index), seed=index)
+        mirrored = features.keypoints * [-1.0, 1.0] + [CAMERA.width, 0.0]
+        result = localize(scene_map, replace(features, keypoints=mirrored.astype(np.float32)))
+        check_invariants(result)
+        assert not result.accepted
+
+
+@pytest.mark.parametrize(
+    'image',
+    [
+        np.zeros((480, 640), np.uint16),
+        np.zeros((480, 640, 4), np.uint8),
+        np.zeros((480, 640, 3), np.float32),
+        np.zeros((0, 640), np.uint8),
+        np.zeros(640, np.uint8),
+    ],
+)
+def test_what_is_no_image_is_refused(scene_map: SceneMap, image: np.ndarray) -> None:
+    result = make_localizer(scene_map, {}).localize(image, CAMERA)
+    assert result.status is Status.UNDECODABLE_IMAGE
+    assert result.reason
+
+
+def test_image_of_another_size_than_the_camera_is_refused(scene_map: SceneMap) -> None:
+    result = make_localizer(scene_map, {}).localize(np.zeros((240, 320), np.uint8), CAMERA)
+    assert result.status is Status.NO_CALIBRATION
+    assert result.reason
+
+
+def test_empty_map_gives_no_scene(scene_map: SceneMap) -> None:
+    empty = replace(
+        scene_map,
+        image_names=(),
+        camera_from_map=(),
+        observation_offsets=np.zeros(1, np.int64),
+        observation_points=np.zeros(0, np.int32),
+        global_descriptors=scene_map.global_descriptors[:0],
+    )
+    result = localize(empty, features_of(PLACE, query_pose(0), seed=0))
+    assert result.status is Status.NO_SCENE
+    assert result.scenes_tried == 0
+
+
+def test_good_scene_ends_the_search_and_weak_ones_do_not(scene_map: SceneMap) -> None:
+    features = features_of(PLACE, query_pose(0), seed=0)
+    assert localize(scene_map, features).scenes_tried == 1
+    never_enough = localize(scene_map, features, enough_inliers=10**6, scene_images=2, max_scenes=3)
+    assert never_enough.scenes_tried == 3
+    assert never_enough.accepted
+
+
+def test_best_rejected_pose_is_kept_with_its_reason(scene_map: SceneMap) -> None:
+    result = localize(
+        scene_map,
+        features_of(PLACE, query_pose(0), seed=0),
+        verdict=VerdictOptions(min_coverage=1.1),
+    )
+    check_invariants(result)
+    assert result.status is Status.POOR_COVERAGE
+    assert result.estimate is not None
+    assert result.scene in scene_map.image_names
+
+
+@given(
+    keep=st.integers(0, 80),
+    clutter=st.integers(0, 300),
+    view=st.integers(0, 20),
+)
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_every_result_is_well_formed(
+    scene_map: SceneMap, keep: int, clutter: int, view: int
+) -> None:
+    features = features_of(PLACE, query_pose(view), seed=view, clutter=clutter)
+    correct = len(features) - clutter
+    chosen = np.r_[np.arange(min(keep, correct)), np.arange(correct, len(features))]
+    result = localize(
+        scene_map,
+        replace(
+            features,
+            keypoints=features.keypoints[chosen],
+            descriptors=features.descriptors[chosen],
+            scores=features.scores[chosen],
+        ),
+    )
+    check_invariants(result)
+    if result.accepted:
+        assert pose_error(result.estimate.camera_from_map, query_pose(view)).position < 0.3
+
+
+@pytest.mark.parametrize(
+    'identity',
+    [
+        replace(IDENTITY, name='other'),
+        replace(IDENTITY, dimension=128),
+        replace(IDENTITY, weights_sha256='retrained'),
+    ],
+)
+def test_refuses_a_map_of_another_extractor(scene_map: SceneMap, identity: object) -> None:
+    extractor = ViewExtractor({})
+    extractor.identity = identity
+    with pytest.raises(MapError):
+        Localizer(scene_map, extractor, NearestNeighbourRatio())
+
+
+def test_refuses_a_map_of_another_retrieval(scene_map: SceneMap) -> None:
+    other = replace(scene_map, manifest=replace(scene_map.manifest, retrieval='netvlad'))
+    with pytest.raises(MapError):
+        make_localizer(other, {})
+
+
+def test_load_refuses_a_map_of_an_unknown_extractor(scene_map: SceneMap) -> None:
+    with pytest.raises(MapError):
+        Localizer.load(scene_map.path)

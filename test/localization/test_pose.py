@@ -1,0 +1,227 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses from synthetic matches with known truth: accuracy, honest covariance, hopeless input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from gam_relocalizer.geometry import pose_error, rigid3d_from_rotation, rotation_of
+from gam_relocalizer.localization.pose import (
+    AbsolutePose,
+    PoseOptions,
+    estimate_pose,
+    undistort,
+)
+
+PINHOLE = pycolmap.Camera(
+    camera_id=1, model='PINHOLE', width=1024, height=768, params=[800, 810, 520, 380]
+)
+FISHEYE = pycolmap.Camera(
+    camera_id=1,
+    model='OPENCV_FISHEYE',
+    width=1024,
+    height=768,
+    params=[380, 380, 512, 384, 0.02, -0.01, 0.002, 0.0],
+)
+MODELS = sorted(pycolmap.CameraModelId.__members__.keys() - {'INVALID', 'EQUIRECTANGULAR'})
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Matches and the pose they came from."""
+
+    keypoints: np.ndarray
+    points: np.ndarray
+    weights: np.ndarray
+    camera_from_map: pycolmap.Rigid3d
+
+
+def make_trial(
+    camera: pycolmap.Camera,
+    seed: int,
+    matches: int = 150,
+    outliers: int = 50,
+    noise: float = 1.0,
+    unit: float = 1.0,
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Trial:
+    rng = np.random.default_rng(seed)
+    pixels = rng.uniform([20, 20], [camera.width - 20, camera.height - 20], (3 * matches, 2))
+    rays = undistort(pixels, camera)
+    known = np.flatnonzero(np.isfinite(rays).all(axis=1))[:matches]
+    depth = rng.uniform(3.0, 9.0, (len(known), 1)) * unit
+    in_camera = np.hstack([rays[known], np.ones_like(depth)]) * depth
+    rotation = Rotation.random(rng=rng)
+    position = rng.normal(0.0, unit, 3) + centre
+    camera_from_map = rigid3d_from_rotation(rotation, -rotation.apply(position))
+    points = camera_from_map.inverse() * in_camera
+    keypoints = pixels[known] + rng.normal(0.0, noise, (len(known), 2))
+    weights = rng.uniform(0.3, 1.0, len(known))
+    keypoints[:outliers] = rng.uniform([0, 0], [camera.width, camera.height], (outliers, 2))
+    weights[:outliers] = rng.uniform(0.0, 0.8, outliers)
+    return Trial(keypoints, points, weights, camera_from_map)
+
+
+def estimate(trial: Trial, camera: pycolmap.Camera) -> AbsolutePose:
+    pose = estimate_pose(trial.keypoints, trial.points, trial.weights, camera)
+    assert pose is not None
+    return pose
+
+
+def normalised_error_squared(pose: AbsolutePose, truth: pycolmap.Rigid3d) -> float:
+    estimated, true = pose.camera_from_map.inverse(), truth.inverse()
+    turn = (rotation_of(estimated) * rotation_of(true).inv()).as_rotvec()
+    error = np.concatenate([estimated.translation - true.translation, turn])
+    return float(error @ np.linalg.solve(pose.covariance, error))
+
+
+@pytest.mark.parametrize('camera', [PINHOLE, FISHEYE], ids=['pinhole', 'fisheye'])
+def test_covariance_tells_the_true_spread(camera: pycolmap.Camera) -> None:
+    trials = 300
+    errors = [
+        normalised_error_squared(estimate(trial, camera), trial.camera_from_map)
+        for trial in (make_trial(camera, seed, outliers=20) for seed in range(trials))
+    ]
+    low, high = chi2.ppf([0.025, 0.975], 6 * trials) / trials
+    assert low <= np.mean(errors) <= high
+
+
+@pytest.mark.parametrize('model', MODELS)
+def test_every_camera_model_recovers_the_pose(model: str) -> None:
+    camera = pycolmap.Camera.create_from_model_name(1, model, 700.0, 1024, 768)
+    trial = make_trial(camera, seed=4)
+    error = pose_error(estimate(trial, camera).camera_from_map, trial.camera_from_map)
+    assert error.position < 0.05
+    assert error.rotation_deg < 0.3
+
+
+@pytest.mark.parametrize(
+    ('model', 'params'),
+    [
+        ('OPENCV', [800, 800, 512, 384, -0.3, 0.1, 0.001, -0.001]),
+        ('FULL_OPENCV', [800, 800, 512, 384, 0.3, -0.1, 0.001, 0.0, 0.02, 0.5, 0.0, 0.0]),
+        ('OPENCV_FISHEYE', [330, 330, 512, 384, -0.02, 0.01, 0.0, 0.0]),
+        ('THIN_PRISM_FISHEYE', [330, 330, 512, 384, -0.02, 0.01, 1e-3, 1e-3, 0, 0, 1e-3, 0]),
+    ],
+)
+def test_distortion_is_taken_into_account(model: str, params: list[float]) -> None:
+    camera = pycolmap.Camera(camera_id=1, model=model, width=1024, height=768, params=params)
+    trial = make_trial(camera, seed=9)
+    pose = estimate(trial, camera)
+    error = pose_error(pose.camera_from_map, trial.camera_from_map)
+    assert error.position < 0.05
+    assert error.rotation_deg < 0.5
+    assert np.count_nonzero(pose.inliers[50:]) >= 97
+
+
+@pytest.mark.parametrize(
+    ('model', 'params'),
+    [
+        ('PINHOLE', [330, 330, 512, 384]),
+        ('OPENCV_FISHEYE', [330, 330, 512, 384, -0.02, 0.01, 0.0, 0.0]),
+        ('FOV', [330, 330, 512, 384, 0.9]),
+        ('EUCM', [330, 330, 512, 384, 0.6, 1.0]),
+        ('SIMPLE_DIVISION', [330, 512, 384, -0.3]),
+    ],
+)
+def test_a_known_ray_projects_to_its_keypoint_even_in_the_corners(
+    model: str, params: list[float]
+) -> None:
+    camera = pycolmap.Camera(camera_id=1, model=model, width=1024, height=768, params=params)
+    keypoints = np.random.default_rng(0).uniform([0, 0], [1024, 768], (2000, 2))
+    rays = undistort(keypoints, camera)
+    known = np.isfinite(rays).all(axis=1)
+    again = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(2000)])[known]))
+    assert np.mean(known) > 0.7
+    assert np.linalg.norm(again - keypoints[known], axis=1).max() < 0.5
+
+
+@pytest.mark.parametrize('unit', [1e-3, 1.0, 1e4])
+def test_result_does_not_depend_on_the_unit_of_the_map(unit: float) -> None:
+    trial = make_trial(PINHOLE, seed=2, unit=unit)
+    reference_trial = make_trial(PINHOLE, seed=2)
+    pose, reference = estimate(trial, PINHOLE), estimate(reference_trial, PINHOLE)
+    scale = np.repeat([unit, 1.0], 3)
+    np.testing.assert_allclose(
+        pose.covariance / np.outer(scale, scale), reference.covariance, rtol=1e-3, atol=1e-10
+    )
+    np.testing.assert_array_equal(pose.inliers, reference.inliers)
+
+
+def test_far_from_the_origin_the_covariance_stays_positive_definite() -> None:
+    trial = make_trial(PINHOLE, seed=3, centre=(3e5, 5e6, 100.0))
+    pose = estimate(trial, PINHOLE)
+    np.linalg.cholesky(pose.covariance)
+    assert pose_error(pose.camera_from_map, trial.camera_from_map).position < 0.05
+
+
+def test_same_matches_give_the_same_bytes() -> None:
+    trial = make_trial(PINHOLE, seed=5, outliers=100)
+    first, second = estimate(trial, PINHOLE), estimate(trial, PINHOLE)
+    assert first.camera_from_map.matrix().tobytes() == second.camera_from_map.matrix().tobytes()
+    assert first.covariance.tobytes() == second.covariance.tobytes()
+
+
+def test_finds_few_correct_matches_among_many_when_they_weigh_most() -> None:
+    trial = make_trial(PINHOLE, seed=6, matches=1000, outliers=950)
+    pose = estimate(trial, PINHOLE)
+    assert np.count_nonzero(pose.inliers[950:]) >= 45
+    assert pose_error(pose.camera_from_map, trial.camera_from_map).position < 0.1
+
+
+@given(
+    matches=st.integers(0, 60),
+    share_of_outliers=st.floats(0.0, 1.0),
+    noise=st.floats(0.0, 5.0),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=60, deadline=None)
+def test_a_pose_is_always_well_formed(
+    matches: int, share_of_outliers: float, noise: float, seed: int
+) -> None:
+    trial = make_trial(PINHOLE, seed, matches, int(matches * share_of_outliers), noise)
+    options = PoseOptions(max_iterations=500)
+    pose = estimate_pose(trial.keypoints, trial.points, trial.weights, PINHOLE, options)
+    if pose is None:
+        return
+    assert np.count_nonzero(pose.inliers) >= 4
+    assert np.isfinite(pose.covariance).all()
+    assert (pose.covariance == pose.covariance.T).all()
+    np.linalg.cholesky(pose.covariance)
+    assert np.isfinite(pose.camera_from_map.matrix()).all()
+
+
+@pytest.mark.parametrize('kind', ['one point', 'a line', 'one pixel'])
+def test_degenerate_matches_give_no_confident_pose(kind: str) -> None:
+    trial = make_trial(PINHOLE, seed=7, outliers=0)
+    keypoints, points = trial.keypoints.copy(), trial.points.copy()
+    if kind == 'one point':
+        points[:] = points[0]
+    elif kind == 'a line':
+        points[:] = points[0] + np.linspace(0.0, 1.0, len(points))[:, None] * [1.0, 2.0, 3.0]
+        keypoints[:] = np.asarray(PINHOLE.img_from_cam(trial.camera_from_map * points))
+    else:
+        keypoints[:] = keypoints[0]
+    pose = estimate_pose(keypoints, points, trial.weights, PINHOLE)
+    if pose is not None:
+        worst = np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])
+        assert np.count_nonzero(pose.inliers) < 20 or np.rad2deg(worst) > 2.0
+
+
+def test_points_behind_the_camera_are_no_inliers() -> None:
+    trial = make_trial(PINHOLE, seed=8, outliers=0)
+    points = trial.points.copy()
+    centre = trial.camera_from_map.tgt_origin_in_src()
+    points[:10] = 2.0 * centre - points[:10]
+    pose = estimate(Trial(trial.keypoints, points, trial.weights, trial.camera_from_map), PINHOLE)
+    assert not pose.inliers[:10].any()
+    assert np.isinf(pose.errors[:10]).all()
