@@ -20,6 +20,8 @@ from gam_relocalizer.geometry import read_poses
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 
 DEFAULT_OUT = Path(__file__).resolve().parents[1] / 'maps' / 'demo'
+# Keeps the bundle below 15 MB, for it is part of the repository.
+MAX_KEYPOINTS = 1536
 
 
 def main() -> None:
@@ -38,7 +40,9 @@ def main() -> None:
             demo_world(), walk, progress=lambda done, total: show('render', done, total)
         )
         options = MapBuildOptions(
-            camera=parse_camera(walk / 'camera.txt'), poses=read_poses(walk / 'poses.txt')
+            camera=parse_camera(walk / 'camera.txt'),
+            poses=read_poses(walk / 'poses.txt'),
+            max_keypoints=MAX_KEYPOINTS,
         )
         report = build_map(walk / 'images', out, options, show)
     size = sum(file.stat().st_size for file in out.rglob('*') if file.is_file())

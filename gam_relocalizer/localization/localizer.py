@@ -34,12 +34,17 @@ from gam_relocalizer.localization.result import (
 )
 from gam_relocalizer.localization.retrieval import retrieve
 from gam_relocalizer.localization.scenes import expanded_scenes, orientation_kept
-from gam_relocalizer.localization.verdict import VerdictOptions, coverage_of, judge
+from gam_relocalizer.localization.verdict import (
+    VerdictOptions,
+    coverage_of,
+    judge,
+    judge_rival,
+)
 from gam_relocalizer.matching.bmnet import normalise_keypoints
 from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     import pycolmap
@@ -51,6 +56,10 @@ if TYPE_CHECKING:
     from gam_relocalizer.matching.matcher import Matcher, Matches
     from gam_relocalizer.scene_map import SceneMap
 
+# A scene whose image looks this much as alike as the best one is tried even when a pose is found:
+# it may be the same thing in another place.
+COMPETING_SCORE = 0.95
+
 
 @dataclass(frozen=True)
 class LocalizerOptions:
@@ -60,7 +69,8 @@ class LocalizerOptions:
         retrieved_images: Reference images retrieved (R in the paper).
         scene_images: Images in an expanded scene (m in the paper).
         max_scenes: Scenes tried before giving up.
-        enough_inliers: An accepted pose with so many inliers ends the search (early stop).
+        enough_inliers: An accepted pose with so many inliers ends the search (early stop), but for
+            scenes that look as alike.
         max_keypoints: Local features taken from the image, when the localizer is loaded by name.
         pose: How poses are searched.
         verdict: What a pose must show.
@@ -69,7 +79,7 @@ class LocalizerOptions:
     retrieved_images: int = 10
     scene_images: int = 20
     max_scenes: int = 3
-    enough_inliers: int = 100
+    enough_inliers: int = 200
     max_keypoints: int = DEFAULT_MAX_KEYPOINTS
     pose: PoseOptions = field(default_factory=PoseOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
@@ -165,20 +175,39 @@ class Localizer:
         scenes = expanded_scenes(
             retrieved.images.tolist(), self._scene_map, self._options.scene_images
         )
-        best, tried = None, 0
+        scores = dict(zip(retrieved.images.tolist(), retrieved.scores.tolist(), strict=True))
+        attempts: list[LocalizationResult] = []
         for scene in islice(_timed(scenes, clock), self._options.max_scenes):
-            tried += 1
-            attempt = self._localize_in(scene, features, camera, clock)
-            if best is None or _rank(attempt) > _rank(best):
-                best = attempt
-            if best.accepted and best.inliers >= self._options.enough_inliers:
+            competes = scores[scene.image] >= COMPETING_SCORE * max(scores.values())
+            if self._is_settled(attempts) and not competes:
                 break
-        if best is None:
+            attempts.append(self._localize_in(scene, features, camera, clock))
+        if not attempts:
             return LocalizationResult(
                 Status.NO_SCENE,
                 f'no reference image was retrieved; the map has {self._scene_map.num_images}',
             )
-        return replace(best, scenes_tried=tried)
+        return replace(self._uncontested(attempts), scenes_tried=len(attempts))
+
+    def _is_settled(self, attempts: Sequence[LocalizationResult]) -> bool:
+        return any(
+            attempt.accepted and attempt.inliers >= self._options.enough_inliers
+            for attempt in attempts
+        )
+
+    def _uncontested(self, attempts: Sequence[LocalizationResult]) -> LocalizationResult:
+        """The best attempt; rejected when another scene speaks nearly as loud for another pose."""
+        best = max(attempts, key=_rank)
+        if not best.accepted or best.estimate is None:
+            return best
+        points = self._scene_map.points[best.estimate.inlier_points]
+        for attempt in attempts:
+            if attempt is best or attempt.estimate is None:
+                continue
+            verdict = judge_rival(best.estimate, attempt.estimate, points, self._options.verdict)
+            if verdict is not None:
+                return replace(best, status=verdict.status, reason=verdict.reason)
+        return best
 
     def _localize_in(
         self, scene: Scene, features: LocalFeatures, camera: pycolmap.Camera, clock: _Clock

@@ -32,6 +32,7 @@ class Status(Enum):
     POOR_COVERAGE = 16
     UNCERTAIN = 17
     IMPLAUSIBLE = 18
+    AMBIGUOUS = 19
 
 
 @dataclass(frozen=True)

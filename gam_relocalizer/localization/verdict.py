@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gam_relocalizer.geometry import pose_error
 from gam_relocalizer.localization.result import PoseEstimate, Status
 
 if TYPE_CHECKING:
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 # Coverage is counted on a grid of so many cells along each side of the image.
 GRID = 8
+# Poses further apart than this contradict each other: share of the distance of the inliers, angle.
+RIVAL_POSITION_SHARE = 0.2
+RIVAL_ROTATION_DEG = 10.0
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,8 @@ class VerdictOptions:
         min_orientation_kept: Least share of triangles of neighbouring points that query and
             reference image see the same way round. Mirrored points of a wall fit a pose behind the
             wall to the pixel.
+        max_rival_share: Most inliers that a contradicting pose from another scene may have, per
+            inlier of the best. Places that look alike (the same poster in two rooms) show up here.
     """
 
     min_inliers: int = 25
@@ -49,6 +55,7 @@ class VerdictOptions:
     max_relative_std: float = 0.05
     max_rotation_std_deg: float = 2.0
     min_orientation_kept: float = 0.7
+    max_rival_share: float = 0.6
 
 
 @dataclass(frozen=True)
@@ -74,8 +81,7 @@ def judge(
         options: The thresholds.
     """
     position_std, rotation_std_deg = worst_deviations(estimate.covariance)
-    camera_in_map = estimate.camera_from_map.tgt_origin_in_src()
-    distance = float(np.median(np.linalg.norm(inlier_points - camera_in_map, axis=1)))
+    distance = _median_distance(estimate, inlier_points)
     found = (
         f'{estimate.inliers} inliers, {estimate.inlier_ratio:.0%} of the matches, over '
         f'{estimate.coverage:.0%} of the image'
@@ -121,6 +127,34 @@ def judge(
     return Verdict(Status.ACCEPTED, found)
 
 
+def judge_rival(
+    best: PoseEstimate,
+    rival: PoseEstimate,
+    inlier_points: NDArray[np.float64],
+    options: VerdictOptions,
+) -> Verdict | None:
+    """Rejects the best pose when another scene makes nearly as good a case for another one.
+
+    Args:
+        best: The pose with the most inliers.
+        rival: A pose from another scene.
+        inlier_points: [K,3] positions of the inliers of the best pose, map frame.
+        options: The thresholds.
+    """
+    apart = pose_error(rival.camera_from_map, best.camera_from_map)
+    near = RIVAL_POSITION_SHARE * _median_distance(best, inlier_points)
+    if apart.position <= near and apart.rotation_deg <= RIVAL_ROTATION_DEG:
+        return None
+    if rival.inliers < max(options.min_inliers, options.max_rival_share * best.inliers):
+        return None
+    return Verdict(
+        Status.AMBIGUOUS,
+        f'{best.inliers} inliers speak for one pose, {rival.inliers} for another one '
+        f'{apart.position:.3g} and {apart.rotation_deg:.0f} deg away; the place may look like '
+        f'another one in the map',
+    )
+
+
 def coverage_of(keypoints: NDArray[np.floating], camera: pycolmap.Camera) -> float:
     """Share of the cells of a grid over the image that hold a keypoint, 0 to 1."""
     size = np.array([camera.width, camera.height], dtype=float)
@@ -133,3 +167,8 @@ def worst_deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
     position = math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     rotation = math.sqrt(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
     return position, math.degrees(rotation)
+
+
+def _median_distance(estimate: PoseEstimate, inlier_points: NDArray[np.float64]) -> float:
+    camera_in_map = estimate.camera_from_map.tgt_origin_in_src()
+    return float(np.median(np.linalg.norm(inlier_points - camera_in_map, axis=1)))

@@ -13,7 +13,7 @@ import torch
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-BLOCK = 4096
+BLOCK = 2048
 GROUP = 32
 
 
@@ -24,10 +24,12 @@ class Candidates:
     Attributes:
         edges: [T, 2] int64, (keypoint, point), sorted by keypoint, then by distance.
         distances: [T] float32, Euclidean distance of the two unit descriptors.
+        ratios: [T] float32 in [0, 1], the keypoint's nearest distance over this distance.
     """
 
     edges: NDArray[np.int64]
     distances: NDArray[np.float32]
+    ratios: NDArray[np.float32]
 
 
 def knn_ratio(
@@ -52,7 +54,8 @@ def knn_ratio(
     count = min(k, len(point_descriptors))
     queries, keypoints = _usable_directions(descriptors)
     if count < 1 or not len(keypoints):
-        return Candidates(np.empty((0, 2), np.int64), np.empty(0, np.float32))
+        nothing = np.empty(0, np.float32)
+        return Candidates(np.empty((0, 2), np.int64), nothing, nothing)
     with torch.inference_mode():
         neighbours = _nearest(queries, point_descriptors, count)
         distances = _exact_distances(queries, point_descriptors, neighbours)
@@ -60,13 +63,15 @@ def knn_ratio(
     distances = np.take_along_axis(distances, order, axis=1)
     neighbours = np.take_along_axis(neighbours, order, axis=1)
 
-    # a product instead of a quotient: two distances of zero are a tie, not 0 / 0
-    usable = np.isfinite(distances)
-    kept = usable & (distances[:, :1] >= ratio * np.where(usable, distances, 0.0))
-    kept[:, 0] = usable[:, 0]
+    ratios = np.ones_like(distances)
+    comparable = np.isfinite(distances) & (distances > 0)
+    np.divide(distances[:, :1], distances, out=ratios, where=comparable)
+    kept = ratios >= ratio
+    kept[:, 0] = True
+    kept &= np.isfinite(distances)
     rows, columns = np.nonzero(kept)
     edges = np.stack([keypoints[rows], neighbours[rows, columns]], axis=1)
-    return Candidates(edges, distances[rows, columns])
+    return Candidates(edges, distances[rows, columns], ratios[rows, columns])
 
 
 def _usable_directions(descriptors: NDArray[Any]) -> tuple[torch.Tensor, NDArray[np.int64]]:
@@ -111,9 +116,10 @@ def _greatest_of_block(
     much cheaper than a selection over whole rows.
     """
     groups = -(-len(block) // GROUP)
-    cosines = torch.full((len(queries), groups * GROUP), -torch.inf)
+    cosines = torch.empty(len(queries), groups * GROUP)
     torch.matmul(queries, block.T, out=cosines[:, : len(block)])
-    cosines[:, : len(block)].masked_fill_(~usable, -torch.inf)
+    cosines[:, len(block) :] = -torch.inf
+    cosines[:, torch.nonzero(~usable)[:, 0]] = -torch.inf
     grouped = cosines.view(len(queries), groups, GROUP)
     _, best_groups = _greatest(grouped.amax(dim=2), min(count, groups))
     best_groups = best_groups.sort(dim=1).values

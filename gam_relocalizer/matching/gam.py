@@ -53,12 +53,14 @@ class Gam:
         point_descriptors: NDArray[Any],
     ) -> Matches:
         """See `Matcher.match`; the weights are BMNet's probabilities."""
-        edges = knn_ratio(descriptors, point_descriptors, self._neighbours, self._ratio).edges
-        edges = edges[_have_finite_places(edges, keypoints_normalised, points)]
+        candidates = knn_ratio(descriptors, point_descriptors, self._neighbours, self._ratio)
+        usable = _have_finite_places(candidates.edges, keypoints_normalised, points)
+        edges = candidates.edges[usable]
         if not len(edges):
             return Matches.none()
         weights = self._weigh(edges, keypoints_normalised, points)
-        pooled = hungarian_pooling(edges, weights)
+        # points on one line of sight are alike to the network: among them, looks decide
+        pooled = hungarian_pooling(edges, weights * candidates.ratios[usable])
         return Matches(edges[pooled, 0], edges[pooled, 1], weights[pooled])
 
     def _weigh(

@@ -134,14 +134,29 @@ def no_features() -> LocalFeatures:
     )
 
 
-def save_place(path: Path, place: Place, map_frame: MapFrame | None = None) -> SceneMap:
-    """Saves the ring of reference images as a map bundle and loads it again."""
-    poses = [ring_pose(index) for index in range(NUM_IMAGES)]
+def twin_of(place: Place, offset: np.ndarray) -> tuple[Place, list[pycolmap.Rigid3d]]:
+    """The place and, at an offset, the same place again; and the rings of both."""
+    twins = Place()
+    twins.points = np.vstack([place.points, place.points + offset])
+    twins.descriptors = np.vstack([place.descriptors, place.descriptors])
+    back = pycolmap.Rigid3d(rotation=pycolmap.Rotation3d(), translation=-offset)
+    ring = [ring_pose(index) for index in range(NUM_IMAGES)]
+    return twins, [*ring, *(pose * back for pose in ring)]
+
+
+def save_place(
+    path: Path,
+    place: Place,
+    map_frame: MapFrame | None = None,
+    poses: list[pycolmap.Rigid3d] | None = None,
+) -> SceneMap:
+    """Saves reference images, the ring if no others are given, as a map bundle and loads it."""
+    poses = poses or [ring_pose(index) for index in range(NUM_IMAGES)]
     seen = [place.seen_by(pose)[0] for pose in poses]
     everything = np.vstack([place.descriptors[visible] for visible in seen])
     vlad = Vlad.train(everything, words=16)
     content = MapContent(
-        image_names=tuple(f'{index:03}.png' for index in range(NUM_IMAGES)),
+        image_names=tuple(f'{index:03}.png' for index in range(len(poses))),
         camera_from_sfm=tuple(poses),
         points=place.points,
         descriptors=place.descriptors,

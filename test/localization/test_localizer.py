@@ -22,6 +22,7 @@ from synthetic_place import (
     no_features,
     query_pose,
     save_place,
+    twin_of,
 )
 
 from gam_relocalizer.errors import MapError
@@ -34,6 +35,7 @@ from gam_relocalizer.scene_map import MapFrame
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from gam_relocalizer.features.local import LocalFeatures
     from gam_relocalizer.scene_map import SceneMap
@@ -189,6 +191,14 @@ def test_good_scene_ends_the_search_and_weak_ones_do_not(scene_map: SceneMap) ->
     never_enough = localize(scene_map, features, enough_inliers=10**6, scene_images=2, max_scenes=3)
     assert never_enough.scenes_tried == 3
     assert never_enough.accepted
+
+
+def test_same_place_twice_in_the_map_gives_no_fix(tmp_path: Path) -> None:
+    twins, poses = twin_of(PLACE, np.array([0.0, 0.0, 100.0]))
+    scene_map = save_place(tmp_path / 'twins', twins, poses=poses)
+    result = localize(scene_map, features_of(PLACE, query_pose(0), seed=0))
+    assert result.status is Status.AMBIGUOUS
+    assert result.inliers >= LocalizerOptions().enough_inliers
 
 
 def test_best_rejected_pose_is_kept_with_its_reason(scene_map: SceneMap) -> None:

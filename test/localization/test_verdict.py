@@ -19,6 +19,7 @@ from gam_relocalizer.localization.verdict import (
     VerdictOptions,
     coverage_of,
     judge,
+    judge_rival,
     worst_deviations,
 )
 
@@ -70,6 +71,32 @@ def test_refuses_few_inliers() -> None:
         GOOD, inlier_keypoints=GOOD.inlier_keypoints[:few], inlier_points=np.arange(few)
     )
     assert judge(estimate, POINTS[:few], 1.0, OPTIONS).status is Status.TOO_FEW_INLIERS
+
+
+def rival(position: float, turn_deg: float, inliers: int) -> PoseEstimate:
+    half = np.radians(turn_deg) / 2.0
+    return replace(
+        GOOD,
+        camera_from_map=rigid3d_from([np.cos(half), 0.0, np.sin(half), 0.0], [position, 0, 0]),
+        inlier_points=np.arange(inliers),
+    )
+
+
+@pytest.mark.parametrize(
+    ('other', 'status'),
+    [
+        (rival(3.0, 0.0, 65), Status.AMBIGUOUS),
+        (rival(0.0, 90.0, 65), Status.AMBIGUOUS),
+        (rival(3.0, 0.0, 55), None),
+        (rival(0.2, 3.0, 100), None),
+    ],
+    ids=['elsewhere', 'turned', 'elsewhere with few inliers', 'the same pose again'],
+)
+def test_refuses_a_pose_that_another_scene_contradicts(
+    other: PoseEstimate, status: Status | None
+) -> None:
+    verdict = judge_rival(GOOD, other, POINTS, OPTIONS)
+    assert (verdict and verdict.status) is status
 
 
 @given(st.floats(1e-3, 1e3))

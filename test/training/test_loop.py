@@ -40,7 +40,7 @@ OPTIONS = TrainingOptions(
 )
 
 
-class Interrupt(Exception):
+class InterruptError(Exception):
     pass
 
 
@@ -54,7 +54,7 @@ class Recorder:
     def on_step(self, step: int, loss: float) -> None:
         self.losses[step] = loss
         if step == self._stop_after:
-            raise Interrupt
+            raise InterruptError
 
     def on_validation(self, step: int, metrics: MatchMetrics) -> None:
         assert 0 <= metrics.average_precision <= 1
@@ -105,7 +105,7 @@ def test_a_resumed_run_ends_as_an_uninterrupted_one(
     finished: tuple[Path, dict[int, float]], tmp_path: Path
 ) -> None:
     directory = tmp_path / 'out'
-    with pytest.raises(Interrupt):
+    with pytest.raises(InterruptError):
         Trainer(OPTIONS, directory).run(Recorder(stop_after=5), checkpoint_seconds=0)
 
     trainer = Trainer(OPTIONS, directory)

@@ -1,0 +1,72 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""What the node publishes."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Path
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from gam_relocalizer.ros.conversions import (
+    pose_stamped_message,
+    pose_with_covariance_message,
+    status_message,
+)
+from gam_relocalizer_msgs.msg import RelocalizationStatus
+
+if TYPE_CHECKING:
+    import pycolmap
+    from rclpy.lifecycle import LifecycleNode
+    from std_msgs.msg import Header
+
+    from gam_relocalizer.localization.result import LocalizationResult
+    from gam_relocalizer.localization.robot_pose import RobotPose
+
+POSE_TOPIC = '/relocalized_pose'
+# Serves subscribers that are sensor-data, reliable or transient-local; late ones get the last fix.
+POSE_QOS = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+PATH_LENGTH = 1000
+
+
+class Outputs:
+    """The publishers; silent while the node is not active."""
+
+    def __init__(self, node: LifecycleNode) -> None:
+        create = node.create_lifecycle_publisher
+        self._pose = create(PoseWithCovarianceStamped, POSE_TOPIC, POSE_QOS)
+        self._camera_pose = create(PoseStamped, '~/camera_pose', 10)
+        self._status = create(RelocalizationStatus, '~/status', 10)
+        self._path = create(Path, '~/path', 1)
+        self._fixes: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
+
+    def publish_fix(
+        self, header: Header, robot_pose: RobotPose, camera_from_map: pycolmap.Rigid3d
+    ) -> None:
+        """An accepted pose: that of the base, that of the camera, and the path so far.
+
+        Args:
+            header: Stamp of the image, frame of the map.
+            robot_pose: Pose of the base.
+            camera_from_map: Pose of the camera.
+        """
+        self._pose.publish(pose_with_covariance_message(robot_pose, header))
+        self._camera_pose.publish(pose_stamped_message(camera_from_map.inverse(), header))
+        self._fixes.append(pose_stamped_message(robot_pose.map_from_base, header))
+        if self._path.get_subscription_count():
+            self._path.publish(Path(header=header, poses=list(self._fixes)))
+
+    def publish_status(self, header: Header, result: LocalizationResult, map_id: str) -> None:
+        """The verdict on an attempt."""
+        self._status.publish(status_message(result, header, map_id))
+
+    def forget_path(self) -> None:
+        """Starts the path anew."""
+        self._fixes.clear()

@@ -1,0 +1,88 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""The one thread that owns the model."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from gam_relocalizer.ros.attempt import carry_out
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
+    from gam_relocalizer.localization.result import LocalizationResult
+    from gam_relocalizer.ros.attempt import Attempt
+
+
+@dataclass(frozen=True)
+class _Job:
+    attempt: Attempt
+    future: Future[LocalizationResult]
+
+
+class Worker:
+    """Carries out one attempt at a time; there is no queue.
+
+    All methods are for one thread, the one that spins the node.
+    """
+
+    def __init__(self, localizer: Localizer, on_done: Callable[[], None]) -> None:
+        """Starts idle.
+
+        Args:
+            localizer: The model.
+            on_done: Called from the worker's thread when a result can be fetched.
+        """
+        self._localizer = localizer
+        self._map_id = localizer.scene_map.manifest.map_id
+        self._on_done = on_done
+        self._job: _Job | None = None
+        self._wanted = True
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix='relocalizer')
+
+    @property
+    def busy(self) -> bool:
+        """Whether an attempt is under way, or done and not yet fetched."""
+        return self._job is not None
+
+    @property
+    def map_id(self) -> str:
+        """Identity of the map that is searched."""
+        return self._map_id
+
+    def begin(self, attempt: Attempt) -> None:
+        """Starts an attempt; the worker must not be busy."""
+        if self.busy:
+            msg = 'the worker is busy'
+            raise RuntimeError(msg)
+        future = self._pool.submit(carry_out, attempt, self._localizer)
+        self._job, self._wanted = _Job(attempt, future), True
+        future.add_done_callback(lambda _future: self._on_done())
+
+    def abandon(self) -> None:
+        """The result of the attempt under way is no longer wanted."""
+        self._wanted = False
+
+    def fetch(self) -> tuple[Attempt, LocalizationResult] | None:
+        """The finished attempt, which makes the worker idle; None while there is none.
+
+        An exception of the attempt is raised here: it is a defect, and hiding it would leave a
+        node that looks alive.
+        """
+        if self._job is None or not self._job.future.done():
+            return None
+        job, self._job = self._job, None
+        result = job.future.result()
+        return (job.attempt, result) if self._wanted else None
+
+    def use(self, options: LocalizerOptions) -> None:
+        """Takes other options from the next attempt on."""
+        self._localizer = self._localizer.with_options(options)
+
+    def close(self) -> None:
+        """Waits for the attempt under way, then ends the thread."""
+        self._pool.shutdown(wait=True, cancel_futures=True)

@@ -1,0 +1,150 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import yaml
+from rclpy.parameter import Parameter
+
+from gam_relocalizer.errors import UsageError
+from gam_relocalizer.localization.localizer import LocalizerOptions
+from gam_relocalizer.localization.robot_pose import CovarianceMode, CovarianceOptions
+from gam_relocalizer.ros.node import RelocalizerNode
+from gam_relocalizer.ros.parameters import SPECIFICATIONS, NodeParameters
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+REPOSITORY = Path(__file__).parents[2]
+NUMBERS = [name for name, entry in SPECIFICATIONS.items() if entry.bounds]
+
+
+def result_of(node: RelocalizerNode, name: str, value: object) -> tuple[bool, str]:
+    result = node.set_parameters([Parameter(name, value=value)])[0]
+    return result.successful, result.reason
+
+
+@pytest.fixture
+def node(ros: None) -> Iterator[RelocalizerNode]:  # noqa: ARG001 - ROS must be up
+    node = RelocalizerNode()
+    yield node
+    node.destroy_node()
+
+
+def test_defaults_are_those_of_the_localizer() -> None:
+    assert NodeParameters().localizer_options() == LocalizerOptions()
+    assert NodeParameters().covariance_options() == CovarianceOptions()
+
+
+def test_thresholds_and_covariance_reach_the_core() -> None:
+    parameters = NodeParameters(
+        min_inliers=33, scene_images=7, position_covariance_scale=4.0, covariance_mode='diagonal'
+    )
+    assert parameters.localizer_options().verdict.min_inliers == 33
+    assert parameters.localizer_options().scene_images == 7
+    # a factor on the covariance is the square of one on the standard deviation
+    assert parameters.covariance_options().position_scale == 2.0
+    assert parameters.covariance_options().mode is CovarianceMode.DIAGONAL
+
+
+def test_the_file_of_parameters_agrees_with_the_declarations() -> None:
+    file = REPOSITORY / 'config' / 'params.yaml'
+    content = yaml.safe_load(file.read_text(encoding='utf-8'))
+    parameters = content['/**']['ros__parameters']
+    assert parameters == asdict(NodeParameters())
+    for entry in fields(NodeParameters):
+        assert type(parameters[entry.name]) is type(entry.default), entry.name
+
+
+def test_the_documentation_lists_every_parameter() -> None:
+    page = (REPOSITORY / 'docs' / 'ros_interface.md').read_text(encoding='utf-8')
+    assert [name for name in SPECIFICATIONS if f'| `{name}` |' not in page] == []
+
+
+@pytest.mark.parametrize('name', NUMBERS)
+def test_numbers_beyond_their_bounds_are_refused(name: str) -> None:
+    low, high = SPECIFICATIONS[name].bounds
+    kind = type(getattr(NodeParameters(), name))
+    for value in (low, high):
+        assert getattr(replace(NodeParameters(), **{name: kind(value)}), name) == value
+    for value in (low - 1, high + 1):
+        with pytest.raises(UsageError, match=name):
+            replace(NodeParameters(), **{name: kind(value)})
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_not_finite_are_refused(value: float) -> None:
+    with pytest.raises(UsageError, match='period'):
+        NodeParameters(period=value)
+
+
+@pytest.mark.parametrize(
+    'name', ['image_transport', 'image_reliability', 'covariance_mode', 'map_frame']
+)
+def test_texts_outside_their_choices_are_refused(name: str) -> None:
+    with pytest.raises(UsageError, match=name):
+        replace(NodeParameters(), **{name: ''})
+
+
+def test_a_mount_is_read_in_the_order_of_static_transform_publisher() -> None:
+    base_from_camera = NodeParameters(base_from_camera='1 2 3 0 0 0.6 0.8').mount()
+    assert base_from_camera is not None
+    np.testing.assert_allclose(base_from_camera.translation, [1, 2, 3])
+    # a turn about z: x goes to (w^2 - z^2, 2 w z)
+    turned = base_from_camera * np.array([1.0, 0.0, 0.0]) - base_from_camera.translation
+    np.testing.assert_allclose(turned, [0.28, 0.96, 0.0], atol=1e-12)
+
+
+def test_without_a_mount_tf_is_asked() -> None:
+    assert NodeParameters(base_from_camera='').mount() is None
+
+
+@pytest.mark.parametrize(
+    'text', ['1 2 3', '0 0 0 0 0 0 0', '1 2 3 0 0 0 nan', 'a b c d e f g', '1 2 3 0 0 0 1 0']
+)
+def test_impossible_mounts_are_refused(text: str) -> None:
+    with pytest.raises(UsageError, match='base_from_camera'):
+        NodeParameters(base_from_camera=text)
+
+
+def test_every_parameter_is_described(node: RelocalizerNode) -> None:
+    for name, specification in SPECIFICATIONS.items():
+        descriptor = node.describe_parameter(name)
+        assert descriptor.description
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        assert bool(ranges) == (specification.bounds is not None)
+        assert descriptor.read_only == specification.read_only
+
+
+def test_values_are_checked_when_set(node: RelocalizerNode) -> None:
+    assert result_of(node, 'period', 0.5) == (True, '')
+    for name, value, word in [
+        ('period', 0.0, 'period'),
+        ('period', math.nan, 'period'),
+        ('period', 1, 'DOUBLE'),
+        ('min_inliers', 3, 'min_inliers'),
+        ('covariance_mode', 'half', 'full, diagonal'),
+        ('base_from_camera', '1 2', 'seven'),
+        ('autostart', False, 'read-only'),
+    ]:
+        successful, reason = result_of(node, name, value)
+        assert not successful
+        assert word in reason
+    assert node.get_parameter('period').value == 0.5
+
+
+def test_the_map_may_be_named_while_the_node_is_unconfigured(node: RelocalizerNode) -> None:
+    assert result_of(node, 'map', '/some/map') == (True, '')
+
+
+@pytest.mark.usefixtures('ros')
+def test_bad_values_at_the_start_are_usage_errors() -> None:
+    for name, value, word in [('period', 1, 'decimal point'), ('max_scenes', 0, 'max_scenes')]:
+        with pytest.raises(UsageError, match=word):
+            RelocalizerNode([Parameter(name, value=value)])

@@ -1,0 +1,131 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from sensor_msgs.msg import Image
+
+from gam_relocalizer.cameras import CameraCalibration
+from gam_relocalizer.localization.localizer import LocalizerOptions
+from gam_relocalizer.localization.result import LocalizationResult, Status
+from gam_relocalizer.ros.attempt import Attempt
+from gam_relocalizer.ros.schedule import StampedImage
+from gam_relocalizer.ros.worker import Worker
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+LIMIT_S = 10.0
+CALIBRATION = CameraCalibration(
+    width=2, height=1, distortion_model='', d=(), k=(1, 0, 1, 0, 1, 1, 0, 0, 1), p=(0.0,) * 12
+)
+
+
+class GatedLocalizer:
+    """Answers when it is let; its reason tells the options it had."""
+
+    scene_map = SimpleNamespace(manifest=SimpleNamespace(map_id='abc'))
+
+    def __init__(self, gate: threading.Event, options: LocalizerOptions) -> None:
+        self.gate = gate
+        self.options = options
+
+    def with_options(self, options: LocalizerOptions) -> GatedLocalizer:
+        return GatedLocalizer(self.gate, options)
+
+    def localize(self, image: Any, camera: Any) -> LocalizationResult:  # noqa: ANN401, ARG002
+        assert self.gate.wait(LIMIT_S)
+        if image.max() == 255:
+            msg = 'a defect'
+            raise ZeroDivisionError(msg)
+        return LocalizationResult(Status.NO_POSE, f'{self.options.max_scenes} scenes')
+
+
+def attempt(brightness: int = 0) -> Attempt:
+    image = Image(height=1, width=2, encoding='mono8', step=2, data=bytes([brightness] * 2))
+    return Attempt(StampedImage(image, 7), '/image', CALIBRATION, image_is_rectified=False)
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.gate = threading.Event()
+        self.done = threading.Event()
+        self.worker = Worker(GatedLocalizer(self.gate, LocalizerOptions()), self.done.set)
+
+    def let_finish(self) -> None:
+        self.gate.set()
+        assert self.done.wait(LIMIT_S)
+        self.done.clear()
+        self.gate.clear()
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    bench = Bench()
+    yield bench
+    bench.gate.set()
+    bench.worker.close()
+
+
+def test_it_is_busy_until_its_result_is_fetched(bench: Bench) -> None:
+    assert not bench.worker.busy
+    asked = attempt()
+    bench.worker.begin(asked)
+    assert bench.worker.busy
+    assert bench.worker.fetch() is None
+    bench.let_finish()
+    assert bench.worker.busy
+    finished = bench.worker.fetch()
+    assert finished is not None
+    assert finished[0] is asked
+    assert finished[1].status is Status.NO_POSE
+    assert not bench.worker.busy
+
+
+def test_it_takes_no_second_attempt_while_busy(bench: Bench) -> None:
+    bench.worker.begin(attempt())
+    with pytest.raises(RuntimeError):
+        bench.worker.begin(attempt())
+
+
+def test_an_abandoned_attempt_comes_to_nothing_and_the_next_one_counts(bench: Bench) -> None:
+    bench.worker.begin(attempt())
+    bench.worker.abandon()
+    bench.let_finish()
+    assert bench.worker.fetch() is None
+    assert not bench.worker.busy
+    bench.worker.begin(attempt())
+    bench.let_finish()
+    assert bench.worker.fetch() is not None
+
+
+def test_other_options_hold_from_the_next_attempt_on(bench: Bench) -> None:
+    bench.worker.begin(attempt())
+    bench.worker.use(LocalizerOptions(max_scenes=9))
+    bench.let_finish()
+    first = bench.worker.fetch()
+    bench.worker.begin(attempt())
+    bench.let_finish()
+    second = bench.worker.fetch()
+    assert first is not None
+    assert second is not None
+    assert (first[1].reason, second[1].reason) == ('3 scenes', '9 scenes')
+
+
+def test_a_defect_comes_out_where_the_result_is_fetched(bench: Bench) -> None:
+    bench.worker.begin(attempt(brightness=255))
+    bench.let_finish()
+    with pytest.raises(ZeroDivisionError):
+        bench.worker.fetch()
+    assert not bench.worker.busy
+
+
+def test_closing_waits_for_the_attempt_under_way(bench: Bench) -> None:
+    bench.worker.begin(attempt())
+    threading.Timer(0.1, bench.gate.set).start()
+    bench.worker.close()
+    assert bench.worker.fetch() is not None
