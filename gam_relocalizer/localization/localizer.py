@@ -78,7 +78,7 @@ class LocalizerOptions:
 
     retrieved_images: int = 10
     scene_images: int = 20
-    max_scenes: int = 3
+    max_scenes: int = 5
     enough_inliers: int = 200
     max_keypoints: int = DEFAULT_MAX_KEYPOINTS
     pose: PoseOptions = field(default_factory=PoseOptions)

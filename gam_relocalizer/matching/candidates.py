@@ -24,12 +24,10 @@ class Candidates:
     Attributes:
         edges: [T, 2] int64, (keypoint, point), sorted by keypoint, then by distance.
         distances: [T] float32, Euclidean distance of the two unit descriptors.
-        ratios: [T] float32 in [0, 1], the keypoint's nearest distance over this distance.
     """
 
     edges: NDArray[np.int64]
     distances: NDArray[np.float32]
-    ratios: NDArray[np.float32]
 
 
 def knn_ratio(
@@ -54,8 +52,7 @@ def knn_ratio(
     count = min(k, len(point_descriptors))
     queries, keypoints = _usable_directions(descriptors)
     if count < 1 or not len(keypoints):
-        nothing = np.empty(0, np.float32)
-        return Candidates(np.empty((0, 2), np.int64), nothing, nothing)
+        return Candidates(np.empty((0, 2), np.int64), np.empty(0, np.float32))
     with torch.inference_mode():
         neighbours = _nearest(queries, point_descriptors, count)
         distances = _exact_distances(queries, point_descriptors, neighbours)
@@ -71,7 +68,7 @@ def knn_ratio(
     kept &= np.isfinite(distances)
     rows, columns = np.nonzero(kept)
     edges = np.stack([keypoints[rows], neighbours[rows, columns]], axis=1)
-    return Candidates(edges, distances[rows, columns], ratios[rows, columns])
+    return Candidates(edges, distances[rows, columns])
 
 
 def _usable_directions(descriptors: NDArray[Any]) -> tuple[torch.Tensor, NDArray[np.int64]]:

@@ -52,15 +52,19 @@ class Gam:
         points: NDArray[Any],
         point_descriptors: NDArray[Any],
     ) -> Matches:
-        """See `Matcher.match`; the weights are BMNet's probabilities."""
+        """See `Matcher.match`; the weights are BMNet's probabilities.
+
+        The pooling maximises probability times cosine of the descriptors, not probability alone.
+        """
         candidates = knn_ratio(descriptors, point_descriptors, self._neighbours, self._ratio)
         usable = _have_finite_places(candidates.edges, keypoints_normalised, points)
         edges = candidates.edges[usable]
         if not len(edges):
             return Matches.none()
         weights = self._weigh(edges, keypoints_normalised, points)
-        # points on one line of sight are alike to the network: among them, looks decide
-        pooled = hungarian_pooling(edges, weights * candidates.ratios[usable])
+        # points near one line of sight are all alike to the network: among them, looks decide
+        cosines = 1.0 - candidates.distances[usable] ** 2 / 2.0
+        pooled = hungarian_pooling(edges, weights * cosines)
         return Matches(edges[pooled, 0], edges[pooled, 1], weights[pooled])
 
     def _weigh(

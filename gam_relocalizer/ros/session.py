@@ -58,6 +58,7 @@ class Session:
         self._schedule = Schedule()
         self._calibration: CameraCalibration | None = None
         self._heard_an_image = False
+        self._waited_for_calibration = False
         self._transforms: TransformListener | None = None
         self._listen_to_transforms()
         self._inputs = Inputs(node, parameters, self._on_image, self._on_camera_info)
@@ -121,7 +122,7 @@ class Session:
         self._schedule.tick()
         if not self._heard_an_image:
             self._say_silence()
-        if self._schedule.ready and self._calibration is None:
+        if self._schedule.ready and self._calibration is None and self._gave_calibration_time():
             topic = self._inputs.camera_info_topic
             reason = (
                 f'no CameraInfo has come on {topic}; have the driver publish it, or remap '
@@ -129,6 +130,11 @@ class Session:
             )
             self._refuse(self._schedule.take(), Status.NO_CALIBRATION, reason)
         self._proceed()
+
+    def _gave_calibration_time(self) -> bool:
+        """False once: the CameraInfo may come a moment after its image, and after this tick."""
+        waited, self._waited_for_calibration = self._waited_for_calibration, True
+        return waited
 
     def _on_jump_back(self, _jump: TimeJump) -> None:
         self._restart('the clock jumped back')

@@ -185,7 +185,7 @@ class Trainer:
         """
         self._claim_directory()
         validation = validation_set(self.options)
-        metrics = None
+        metrics, loss = None, None
         saved_at = time.monotonic()
         for batch in self._batches():
             loss = self._optimise(batch)
@@ -196,7 +196,7 @@ class Trainer:
                 self._save_checkpoint()
                 saved_at = time.monotonic()
         if metrics is None or self.step % self.options.validate_every:
-            metrics = self._validate(validation, math.nan, observer)
+            metrics = self._validate(validation, loss, observer)
         self._save_checkpoint()
         return metrics
 
@@ -257,7 +257,7 @@ class Trainer:
         return warm_up * fall
 
     def _validate(
-        self, validation: list[LabelledGraph], loss: float, observer: Observer
+        self, validation: list[LabelledGraph], loss: float | None, observer: Observer
     ) -> MatchMetrics:
         average: BMNet = self._average.module  # type: ignore[assignment]
         metrics = evaluate(average, validation)
@@ -343,11 +343,11 @@ def _fast_bfloat16() -> bool:
     return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())  # noqa: SLF001 - no public way to ask
 
 
-def _read_log(path: Path) -> list[dict[str, float]]:
+def _read_log(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text('utf-8').splitlines()]
 
 
-def _draw_curves(records: list[dict[str, float]], path: Path) -> None:
+def _draw_curves(records: list[dict[str, Any]], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -355,7 +355,7 @@ def _draw_curves(records: list[dict[str, float]], path: Path) -> None:
     FigureCanvasAgg(figure)
     loss, metrics = figure.subplots(1, 2)
     steps = [record['step'] for record in records]
-    loss.plot(steps, [record['loss'] for record in records])
+    loss.plot(steps, [record['loss'] or math.nan for record in records])
     loss.set(title='training loss', xlabel='step')
     for name in ('precision', 'recall', 'average_precision'):
         metrics.plot(steps, [record[name] for record in records], label=name.replace('_', ' '))

@@ -148,3 +148,23 @@ def test_nearest_neighbour_ratio_by_hand() -> None:
 
     np.testing.assert_array_equal(matches.keypoint_indices, [0])
     np.testing.assert_array_equal(matches.point_indices, [0])
+
+
+def test_of_two_points_in_one_place_the_one_that_looks_right_is_matched(
+    gam: Gam, views: list[SyntheticView]
+) -> None:
+    view = views[1]
+    others = np.random.default_rng(0).normal(size=view.point_descriptors.shape)
+    others /= np.linalg.norm(others, axis=1, keepdims=True)
+    count = len(view.points)
+
+    matches = gam.match(
+        view.keypoints,
+        view.descriptors,
+        np.concatenate([view.points, view.points]),
+        np.concatenate([view.point_descriptors, view.point_descriptors + 0.5 * others]),
+    )
+
+    of_original = matches.point_indices[matches.weights > 0.5] < count
+    assert len(of_original) > 30
+    assert of_original.mean() > 0.7
