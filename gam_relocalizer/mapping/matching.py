@@ -73,7 +73,7 @@ def _nearest_in_block(
     """Index, cosine and distinctiveness of the largest entry of each row; overwrites its input."""
     nearest = similarity.max(dim=1)
     # Twice the largest is several times faster than torch.topk.
-    similarity.scatter_(1, nearest.indices[:, None], -1.0)
+    similarity.scatter_(1, nearest.indices[:, None], -torch.inf)
     second = similarity.max(dim=1).values
     # Squared distances of unit vectors are 2 - 2 cos.
     distinctive = 1.0 - nearest.values <= max_ratio**2 * (1.0 - second)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.parameter import Parameter
 from rclpy.utilities import ok, try_shutdown
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+LONGEST_WAIT_S = 0.5
 LOG_PLACES = ('ROS_LOG_DIR', 'ROS_HOME', 'HOME')
 
 
@@ -81,23 +82,27 @@ def _init(args: Sequence[str]) -> None:
 
 def _spin(node: RelocalizerNode) -> None:
     """Spins until the context ends."""
-    while not _spin_until_refusal(node):
-        pass
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while ok():
+        _spin_once(executor, node)
 
 
-def _spin_until_refusal(node: RelocalizerNode) -> bool:
-    """Spins until the context ends, or a request asks for what the present state does not allow.
+def _spin_once(executor: SingleThreadedExecutor, node: RelocalizerNode) -> None:
+    """Waits for something to do, and does it.
 
-    The latter raises in rclpy's own callback for lifecycle transitions, and must not end the node.
+    The wait is bounded: now and then the end of the context wakes no wait that is about to begin,
+    and under a clock that stands still nothing else would wake it either.
+
+    A request for a transition that the present state does not allow raises in rclpy's own callback,
+    and must not end the node.
     """
     try:
-        rclpy.spin(node)
+        executor.spin_once(timeout_sec=LONGEST_WAIT_S)
     except rclpy_implementation.RCLError as err:
         if not ok() or 'transition' not in str(err):
             raise
         node.get_logger().error(f'request refused: {err}')
-        return False
-    return True
 
 
 def _give_logs_a_place() -> None:

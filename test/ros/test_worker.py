@@ -113,7 +113,8 @@ def test_other_options_hold_from_the_next_attempt_on(bench: Bench) -> None:
     second = bench.worker.fetch()
     assert first is not None
     assert second is not None
-    assert (first[1].reason, second[1].reason) == ('3 scenes', '9 scenes')
+    default = f'{LocalizerOptions().max_scenes} scenes'
+    assert (first[1].reason, second[1].reason) == (default, '9 scenes')
 
 
 def test_a_defect_comes_out_where_the_result_is_fetched(bench: Bench) -> None:
