@@ -117,14 +117,15 @@ def _truth(bag: Path) -> dict[int, pycolmap.Rigid3d]:
 def _illustrations(
     bag: Path, rows: tuple[Row, ...], localizer: Localizer
 ) -> tuple[Illustration, ...]:
-    """The fixes with the most and the fewest inliers, localized again to draw their matches."""
+    """A typical fix and the one with the fewest inliers, localized again to draw their matches."""
     from gam_relocalizer.cameras import camera_from_calibration
     from gam_relocalizer.replay.bag import open_bag
     from gam_relocalizer.replay.messages import calibration_in, image_in
     from gam_relocalizer.replay.result import Illustration
 
-    fixes = sorted((row for row in rows if row.robot_pose), key=lambda row: -row.inliers)
-    stamps = [row.stamp_ns for row in (fixes[:1] + fixes[1:][-1:])]
+    fixes = sorted((row for row in rows if row.robot_pose), key=lambda row: row.inliers)
+    middle = len(fixes) // 2
+    stamps = [row.stamp_ns for row in (*fixes[middle : middle + 1], *fixes[:1])]
     with open_bag(bag) as reader:
         info = next(reader.messages([CAMERA_INFO_TOPIC]))
         images = {

@@ -55,7 +55,7 @@ class VerdictOptions:
     max_relative_std: float = 0.05
     max_rotation_std_deg: float = 2.0
     min_orientation_kept: float = 0.7
-    max_rival_share: float = 0.6
+    max_rival_share: float = 0.8
 
 
 @dataclass(frozen=True)

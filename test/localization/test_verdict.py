@@ -85,9 +85,9 @@ def rival(position: float, turn_deg: float, inliers: int) -> PoseEstimate:
 @pytest.mark.parametrize(
     ('other', 'status'),
     [
-        (rival(3.0, 0.0, 65), Status.AMBIGUOUS),
-        (rival(0.0, 90.0, 65), Status.AMBIGUOUS),
-        (rival(3.0, 0.0, 55), None),
+        (rival(3.0, 0.0, 85), Status.AMBIGUOUS),
+        (rival(0.0, 90.0, 85), Status.AMBIGUOUS),
+        (rival(3.0, 0.0, 75), None),
         (rival(0.2, 3.0, 100), None),
     ],
     ids=['elsewhere', 'turned', 'elsewhere with few inliers', 'the same pose again'],
