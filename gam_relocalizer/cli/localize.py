@@ -125,6 +125,9 @@ def _named_files(images: Sequence[Path]) -> dict[str, Path]:
     """Files to read by the name they are reported under, in the order given."""
     files: dict[str, Path] = {}
     for path in images:
+        if not path.exists():
+            msg = f'{path}: no such image or folder'
+            raise UsageError(msg)
         found = (
             {name: path / name for name in list_images(path)}
             if path.is_dir()

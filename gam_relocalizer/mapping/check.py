@@ -81,11 +81,13 @@ def check_map(path: Path) -> CheckReport:
     components = _component_sizes(scene_map.covisibility)
     bridges = _weak_bridges(scene_map)
     seen = np.diff(scene_map.observation_offsets)
+    apart = _component_problems(components)
+    harmless, harmful = (apart, []) if _poses_were_given(manifest) else ([], apart)
     return CheckReport(
         map_id=manifest.map_id,
         counts=manifest.counts,
-        problems=(*_sfm_problems(path, manifest), *_component_problems(components)),
-        warnings=tuple(_warnings(scene_map, bridges)),
+        problems=(*_sfm_problems(path, manifest), *harmful),
+        warnings=(*harmless, *_warnings(scene_map, bridges)),
         components=components,
         weak_bridges=bridges,
         points_per_image=(int(seen.min()), int(np.median(seen)), int(seen.max())),
@@ -111,6 +113,12 @@ def _sfm_problems(path: Path, manifest: Manifest) -> list[str]:
     return []
 
 
+def _poses_were_given(manifest: Manifest) -> bool:
+    """Whether the parts of the map lie to each other as the poses say, whatever they share."""
+    options = manifest.build.get('options')
+    return isinstance(options, dict) and options.get('poses') is not None
+
+
 def _component_sizes(covisibility: csr_matrix) -> tuple[int, ...]:
     _, labels = connected_components(covisibility, directed=False)
     return tuple(sorted(np.bincount(labels).tolist(), reverse=True))
@@ -121,7 +129,7 @@ def _component_problems(components: tuple[int, ...]) -> list[str]:
         return []
     return [
         f'the map falls into {len(components)} parts of {", ".join(map(str, components))} images '
-        f'that share no point: how they lie to each other is arbitrary unless the poses were given'
+        f'that share no point: only camera poses from elsewhere tell how they lie to each other'
     ]
 
 

@@ -167,6 +167,13 @@ def test_folder_without_images_is_an_error(tiny_place: TinyPlace, tmp_path: Path
     assert isinstance(called.exception, UsageError)
 
 
+def test_missing_image_is_an_error(tiny_place: TinyPlace, tmp_path: Path) -> None:
+    missing = tmp_path / 'nowhere.jpg'
+    called = CliRunner().invoke(app, command(tiny_place, missing, '--out', tmp_path / 'poses.txt'))
+    assert isinstance(called.exception, UsageError)
+    assert not list(tmp_path.iterdir())
+
+
 def test_two_images_of_one_name_are_an_error(
     run: Run, tiny_place: TinyPlace, tmp_path: Path
 ) -> None:

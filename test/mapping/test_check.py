@@ -87,6 +87,18 @@ def test_parts_that_share_nothing_are_a_problem(tmp_path: Path) -> None:
     assert len(report.problems) == 1
 
 
+def test_parts_that_given_poses_hold_together_are_no_problem(tmp_path: Path) -> None:
+    seen = [range(100), range(60), range(100, 200)]
+    posed = replace(MANIFEST_TO_BE, build={'options': {'poses': 3}})
+    save_map(tmp_path / 'map', content_seeing(seen), posed, None)
+
+    report = check_map(tmp_path / 'map')
+
+    assert report.components == (2, 1)
+    assert report.problems == ()
+    assert report.warnings
+
+
 def test_a_weak_bridge_is_found(tmp_path: Path) -> None:
     seen = [range(100), range(95), range(90, 200), range(95, 200)]
     save_map(tmp_path / 'map', content_seeing(seen), MANIFEST_TO_BE, None)
