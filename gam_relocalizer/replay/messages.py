@@ -32,9 +32,23 @@ def image_in(message: BagMessage) -> NDArray[np.uint8]:
     Raises:
         ImageError: It cannot be decoded.
     """
-    value, source = message.value, message.topic.name
-    if message.topic.type == COMPRESSED_IMAGE:
-        return decode_compressed(value.data, source)
+    compressed = message.topic.type == COMPRESSED_IMAGE
+    return pixels_of(message.value, compressed=compressed, source=message.topic.name)
+
+
+def pixels_of(value: Any, *, compressed: bool, source: str) -> NDArray[np.uint8]:  # noqa: ANN401
+    """The picture in an Image or CompressedImage of any library: RGB [H,W,3] or grey [H,W].
+
+    Args:
+        value: The message.
+        compressed: Whether it is a CompressedImage.
+        source: Topic, for the error.
+
+    Raises:
+        ImageError: It cannot be decoded.
+    """
+    if compressed:
+        return decode_compressed(np.frombuffer(value.data, dtype=np.uint8), source)
     return decode_image(
         value.encoding,
         int(value.width),
@@ -47,8 +61,12 @@ def image_in(message: BagMessage) -> NDArray[np.uint8]:
 
 
 def calibration_in(message: BagMessage) -> CameraCalibration:
+    """The numbers of a CameraInfo in a bag."""
+    return calibration_of(message.value)
+
+
+def calibration_of(info: Any) -> CameraCalibration:  # noqa: ANN401 - a message of any library
     """The numbers of a CameraInfo."""
-    info = message.value
     return CameraCalibration(
         width=int(info.width),
         height=int(info.height),

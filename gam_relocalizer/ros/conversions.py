@@ -11,22 +11,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, Quaternion
 from sensor_msgs.msg import CompressedImage, Image
 
-from gam_relocalizer.cameras import CameraCalibration
 from gam_relocalizer.errors import TransformError
-from gam_relocalizer.geometry import quaternion_wxyz, rigid3d_from
-from gam_relocalizer.images import decode_compressed, decode_image
+from gam_relocalizer.geometry import quaternion_wxyz
+from gam_relocalizer.replay.messages import pixels_of, rigid_in
 from gam_relocalizer_msgs.msg import RelocalizationStatus
 
 if TYPE_CHECKING:
+    import numpy as np
     import pycolmap
     from geometry_msgs.msg import Transform
     from numpy.typing import NDArray
-    from sensor_msgs.msg import CameraInfo
     from std_msgs.msg import Header
 
     from gam_relocalizer.localization.result import LocalizationResult
@@ -56,46 +54,20 @@ def pixels_from(message: Image | CompressedImage, topic: str) -> NDArray[np.uint
     Raises:
         ImageError: It cannot be decoded.
     """
-    if isinstance(message, CompressedImage):
-        return decode_compressed(np.frombuffer(message.data, dtype=np.uint8), topic)
-    return decode_image(
-        message.encoding,
-        message.width,
-        message.height,
-        message.step,
-        is_bigendian=bool(message.is_bigendian),
-        data=message.data,
-        source=topic,
-    )
-
-
-def calibration_from(message: CameraInfo) -> CameraCalibration:
-    """The numbers of a sensor_msgs/CameraInfo."""
-    roi = message.roi
-    return CameraCalibration(
-        width=int(message.width),
-        height=int(message.height),
-        distortion_model=message.distortion_model,
-        d=tuple(float(value) for value in message.d),
-        k=tuple(float(value) for value in message.k),
-        p=tuple(float(value) for value in message.p),
-        binning=(int(message.binning_x), int(message.binning_y)),
-        roi=(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)),
-    )
+    return pixels_of(message, compressed=isinstance(message, CompressedImage), source=topic)
 
 
 def rigid3d_from_message(transform: Transform) -> pycolmap.Rigid3d:
     """A geometry_msgs/Transform as `parent_from_child`.
 
     Raises:
-        TransformError: Its quaternion is zero.
+        TransformError: Its quaternion is zero, or a number is not finite.
     """
-    rotation, translation = transform.rotation, transform.translation
-    quaternion = (rotation.w, rotation.x, rotation.y, rotation.z)
-    if not any(quaternion):
-        msg = 'the quaternion of a transform is zero'
-        raise TransformError(msg)
-    return rigid3d_from(quaternion, (translation.x, translation.y, translation.z))
+    try:
+        return rigid_in(transform.translation, transform.rotation)
+    except ValueError as err:
+        msg = f'a transform is none: {err}'
+        raise TransformError(msg) from err
 
 
 def pose_message(map_from_body: pycolmap.Rigid3d) -> Pose:

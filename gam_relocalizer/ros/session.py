@@ -15,8 +15,9 @@ from std_msgs.msg import Header
 from gam_relocalizer.errors import TransformError
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import robot_pose
+from gam_relocalizer.replay.messages import calibration_of
 from gam_relocalizer.ros.attempt import Attempt
-from gam_relocalizer.ros.conversions import calibration_from, nanoseconds_from, stamp_from
+from gam_relocalizer.ros.conversions import nanoseconds_from, stamp_from
 from gam_relocalizer.ros.inputs import Inputs
 from gam_relocalizer.ros.schedule import Schedule, StampedImage
 from gam_relocalizer.ros.transform_listener import TransformListener
@@ -115,7 +116,7 @@ class Session:
         self._proceed()
 
     def _on_camera_info(self, message: CameraInfo) -> None:
-        self._calibration = calibration_from(message)
+        self._calibration = calibration_of(message)
         self._proceed()
 
     def _on_tick(self) -> None:

@@ -24,8 +24,8 @@ from gam_relocalizer.localization.result import (
     Timings,
 )
 from gam_relocalizer.localization.robot_pose import RobotPose
+from gam_relocalizer.replay.messages import calibration_of
 from gam_relocalizer.ros.conversions import (
-    calibration_from,
     nanoseconds_from,
     pixels_from,
     pose_stamped_message,
@@ -93,7 +93,7 @@ def test_calibrations_are_read_whole() -> None:
         binning_y=1,
         roi=RegionOfInterest(x_offset=1, y_offset=2, width=30, height=40),
     )
-    calibration = calibration_from(message)
+    calibration = calibration_of(message)
     assert (calibration.width, calibration.height) == (640, 480)
     assert calibration.distortion_model == 'plumb_bob'
     assert calibration.d == (0.1, 0.2, 0.3, 0.4, 0.5)
