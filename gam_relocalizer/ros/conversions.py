@@ -9,11 +9,13 @@ or bool.
 
 from __future__ import annotations
 
+from array import array
 from typing import TYPE_CHECKING
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, Quaternion
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2, PointField
 
 from gam_relocalizer.errors import TransformError
 from gam_relocalizer.geometry import quaternion_wxyz
@@ -21,7 +23,6 @@ from gam_relocalizer.replay.messages import pixels_of, rigid_in
 from gam_relocalizer_msgs.msg import RelocalizationStatus
 
 if TYPE_CHECKING:
-    import numpy as np
     import pycolmap
     from geometry_msgs.msg import Transform
     from numpy.typing import NDArray
@@ -68,6 +69,35 @@ def rigid3d_from_message(transform: Transform) -> pycolmap.Rigid3d:
     except ValueError as err:
         msg = f'a transform is none: {err}'
         raise TransformError(msg) from err
+
+
+def image_message(pixels: NDArray[np.uint8], header: Header) -> Image:
+    """An RGB picture [H,W,3]."""
+    height, width = pixels.shape[:2]
+    # an ndarray as data would be copied byte by byte
+    data = array('B', np.ascontiguousarray(pixels).tobytes())
+    return Image(
+        header=header, height=height, width=width, encoding='rgb8', step=3 * width, data=data
+    )
+
+
+def point_cloud_message(points: NDArray[np.float64], header: Header) -> PointCloud2:
+    """Points [N,3] as an unordered cloud of x, y, z (float32)."""
+    fields = [
+        PointField(name=name, offset=4 * index, datatype=PointField.FLOAT32, count=1)
+        for index, name in enumerate('xyz')
+    ]
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=12,
+        row_step=12 * len(points),
+        data=array('B', points.astype('<f4').tobytes()),
+        is_dense=True,
+    )
 
 
 def pose_message(map_from_body: pycolmap.Rigid3d) -> Pose:

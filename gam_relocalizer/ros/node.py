@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from std_msgs.msg import Header
 
 from gam_relocalizer.errors import RelocalizerError, UsageError
 from gam_relocalizer.localization.localizer import Localizer
@@ -103,7 +104,12 @@ class RelocalizerNode(LifecycleNode):
             raise RuntimeError(msg)
         self._session = Session(self, self._settings, self._worker, self._outputs)
         self.get_logger().info(f'active: one attempt each {self._settings.period:g} s')
-        return super().on_activate(state)
+        outcome = super().on_activate(state)  # publishers are silent before
+        header = Header(
+            stamp=self.get_clock().now().to_msg(), frame_id=self._settings.map_frame
+        )
+        self._outputs.publish_map_points(header, self._worker.scene_map.points)
+        return outcome
 
     @_reported
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import Image, PointCloud2
 
 from gam_relocalizer.ros.conversions import (
+    image_message,
+    point_cloud_message,
     pose_stamped_message,
     pose_with_covariance_message,
     status_message,
@@ -19,7 +22,9 @@ from gam_relocalizer.ros.conversions import (
 from gam_relocalizer_msgs.msg import RelocalizationStatus
 
 if TYPE_CHECKING:
+    import numpy as np
     import pycolmap
+    from numpy.typing import NDArray
     from rclpy.lifecycle import LifecycleNode
     from std_msgs.msg import Header
 
@@ -28,7 +33,7 @@ if TYPE_CHECKING:
 
 POSE_TOPIC = '/relocalized_pose'
 # Serves subscribers that are sensor-data, reliable or transient-local; late ones get the last fix.
-POSE_QOS = QoSProfile(
+LATCHED_QOS = QoSProfile(
     depth=1,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
@@ -41,10 +46,12 @@ class Outputs:
 
     def __init__(self, node: LifecycleNode) -> None:
         create = node.create_lifecycle_publisher
-        self._pose = create(PoseWithCovarianceStamped, POSE_TOPIC, POSE_QOS)
+        self._pose = create(PoseWithCovarianceStamped, POSE_TOPIC, LATCHED_QOS)
         self._camera_pose = create(PoseStamped, '~/camera_pose', 10)
         self._status = create(RelocalizationStatus, '~/status', 10)
         self._path = create(Path, '~/path', 1)
+        self._map_points = create(PointCloud2, '~/map_points', LATCHED_QOS)
+        self._debug_image = create(Image, '~/debug_image', qos_profile_sensor_data)
         self._fixes: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
 
     def publish_fix(
@@ -66,6 +73,19 @@ class Outputs:
     def publish_status(self, header: Header, result: LocalizationResult, map_id: str) -> None:
         """The verdict on an attempt."""
         self._status.publish(status_message(result, header, map_id))
+
+    def publish_map_points(self, header: Header, points: NDArray[np.float64]) -> None:
+        """The points [N,3] of the map; late subscribers get them as well."""
+        self._map_points.publish(point_cloud_message(points, header))
+
+    @property
+    def debug_image_is_wanted(self) -> bool:
+        """Whether somebody listens: drawing costs time."""
+        return bool(self._debug_image.get_subscription_count())
+
+    def publish_debug_image(self, header: Header, picture: NDArray[np.uint8]) -> None:
+        """A picture [H,W,3] of an attempt."""
+        self._debug_image.publish(image_message(picture, header))
 
     def forget_path(self) -> None:
         """Starts the path anew."""

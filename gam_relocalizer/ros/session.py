@@ -17,7 +17,8 @@ from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import robot_pose
 from gam_relocalizer.replay.messages import calibration_of
 from gam_relocalizer.ros.attempt import Attempt
-from gam_relocalizer.ros.conversions import nanoseconds_from, stamp_from
+from gam_relocalizer.ros.conversions import nanoseconds_from, pixels_from, stamp_from
+from gam_relocalizer.ros.debug_image import draw_attempt
 from gam_relocalizer.ros.inputs import Inputs
 from gam_relocalizer.ros.schedule import Schedule, StampedImage
 from gam_relocalizer.ros.transform_listener import TransformListener
@@ -182,6 +183,13 @@ class Session:
         )
 
     def _report(self, attempt: Attempt, result: LocalizationResult) -> None:
+        self._publish(attempt, result)
+        if self._outputs.debug_image_is_wanted and result.status is not Status.UNDECODABLE_IMAGE:
+            pixels = pixels_from(attempt.image.message, attempt.image_topic)
+            header = attempt.image.message.header
+            self._outputs.publish_debug_image(header, draw_attempt(pixels, result))
+
+    def _publish(self, attempt: Attempt, result: LocalizationResult) -> None:
         if not result.accepted or result.estimate is None:
             self._publish_refusal(attempt.image, result)
             return

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
     from gam_relocalizer.localization.result import LocalizationResult
     from gam_relocalizer.ros.attempt import Attempt
+    from gam_relocalizer.scene_map import SceneMap
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,11 @@ class Worker:
     def map_id(self) -> str:
         """Identity of the map that is searched."""
         return self._map_id
+
+    @property
+    def scene_map(self) -> SceneMap:
+        """The map that is searched."""
+        return self._localizer.scene_map
 
     def begin(self, attempt: Attempt) -> None:
         """Starts an attempt; the worker must not be busy."""

@@ -20,11 +20,13 @@ from live_robot import (
     wait_for,
 )
 from nav_msgs.msg import Path
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from gam_relocalizer.geometry import pose_error, rigid3d_from
 from gam_relocalizer.localization.result import Status
+from gam_relocalizer.ros.debug_image import GREEN
+from gam_relocalizer.scene_map import load_map
 from gam_relocalizer_msgs.msg import RelocalizationStatus
 
 if TYPE_CHECKING:
@@ -265,3 +267,37 @@ def test_the_path_grows_with_the_fixes(robot: Robot, tiny_place: TinyPlace) -> N
 def test_messages_and_core_number_the_verdicts_alike() -> None:
     for status in Status:
         assert getattr(RelocalizationStatus, status.name) == status.value
+
+
+def test_a_late_listener_gets_the_points_of_the_map(robot: Robot, tiny_place: TinyPlace) -> None:
+    clouds: list[PointCloud2] = []
+    topic = f'{NODE}/map_points'
+    subscription = robot.node.create_subscription(PointCloud2, topic, clouds.append, LATCHED)
+    cloud = wait_for(lambda: clouds and clouds[0], 'the points of the map')
+    robot.node.destroy_subscription(subscription)
+    points = np.frombuffer(cloud.data, '<f4').reshape(-1, 3)
+    np.testing.assert_allclose(points, load_map(tiny_place.map_path).points, atol=1e-5)
+    assert cloud.header.frame_id == 'map'
+
+
+def test_the_debug_image_shows_the_inliers_to_who_listens(
+    robot: Robot, tiny_place: TinyPlace
+) -> None:
+    pictures: list[Image] = []
+    topic = f'{NODE}/debug_image'
+    subscription = robot.node.create_subscription(
+        Image, topic, pictures.append, qos_profile_sensor_data
+    )
+    pixels = tiny_place.queries[0][0]
+
+    def picture() -> Image | None:
+        robot.ask(image_message(pixels, next(STAMPS)))
+        return pictures[-1] if pictures else None
+
+    drawn = wait_for(picture, 'a debug image')
+    robot.node.destroy_subscription(subscription)
+    shown = np.frombuffer(drawn.data, np.uint8).reshape(pixels.shape)
+    green = (shown == GREEN).all(axis=2)
+    assert green.sum() > 500
+    # nothing but the drawing differs
+    np.testing.assert_array_equal(shown[-5:][~green[-5:]], pixels[-5:][~green[-5:]])
