@@ -42,6 +42,8 @@ PLAYED_TOPICS = ('/tf_static', '/camera/image', '/camera/camera_info')
 START_LIMIT_S = 90.0
 ANSWER_LIMIT_S = 20.0
 QUIET_S = 3.0
+# Our side knows of a match before the node does, in one start of twenty by up to 3.5 s.
+SETTLE_S = 5.0
 STOP_LIMIT_S = 20.0
 
 
@@ -257,6 +259,7 @@ def _wait_until_listening(player: BagPlayer, process: subprocess.Popen[bytes], l
             msg = f'the node did not become active within {START_LIMIT_S:.0f} s; see {log}'
             raise RelocalizerError(msg)
         time.sleep(0.05)
+    time.sleep(SETTLE_S)
 
 
 def _parameter(name: str, value: str) -> Sequence[str]:
