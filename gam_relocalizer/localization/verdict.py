@@ -28,12 +28,9 @@ RIVAL_ROTATION_DEG = 10.0
 class VerdictOptions:
     """What a pose must show to be accepted.
 
-    The defaults lie above what wrong matches reach. Random ones are harmless: among 2000 of them
-    RANSAC finds at most 13 inliers that spread over 8 cells of the image, more only in one blob. In
-    images of another place the matcher looks for geometry and finds some: up to 67 inliers, 4.3 %
-    of the matches, 27 % of the image, though never all at once (108 attempts across four real
-    places). The worst correct poses in a poor map had 98 inliers and 5.3 % of the matches, and they
-    were off by 30 cm.
+    The defaults lie above what wrong matches were seen to reach, random ones and those of images of
+    other places. Inliers in one blob are no evidence, hence the coverage; chance finds more inliers
+    among more matches, hence the ratio.
 
     Attributes:
         min_inliers: Least number of inliers.
