@@ -13,8 +13,11 @@ import torch
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-BLOCK = 2048
+BLOCK = 2048  # points read at once
+TILE = 512  # most keypoints compared at once with a block: the cosines stay in the cache
 GROUP = 32
+NO_POINT = -1
+NO_COSINE = torch.finfo(torch.float32).min  # greater than -inf, which marks what was taken
 
 
 @dataclass(frozen=True)
@@ -50,10 +53,11 @@ def knn_ratio(
         ratio: Least ratio of the nearest distance to the candidate's distance, in [0, 1].
     """
     count = min(k, len(point_descriptors))
-    queries, keypoints = _usable_directions(descriptors)
-    if count < 1 or not len(keypoints):
+    if count < 1 or not len(descriptors):
         return Candidates(np.empty((0, 2), np.int64), np.empty(0, np.float32))
     with torch.inference_mode():
+        directions, usable = _directions(descriptors)
+        queries, keypoints = directions[usable], np.flatnonzero(usable.numpy())
         neighbours = _nearest(queries, point_descriptors, count)
         distances = _exact_distances(queries, point_descriptors, neighbours)
     order = np.argsort(distances, axis=1, kind='stable')
@@ -71,60 +75,62 @@ def knn_ratio(
     return Candidates(edges, distances[rows, columns])
 
 
-def _usable_directions(descriptors: NDArray[Any]) -> tuple[torch.Tensor, NDArray[np.int64]]:
-    """Unit rows [Q, D] of the usable descriptors and their indices [Q]."""
-    rows = np.asarray(descriptors, dtype=np.float32)
-    if not rows.size:
-        return torch.empty((0, 0)), np.empty(0, np.int64)
-    unit, usable = _unit_rows(rows)
-    return unit[usable], np.flatnonzero(usable.numpy())
-
-
-def _unit_rows(rows: NDArray[np.float32]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Unit rows, zero where a row is not usable, and which rows are usable."""
-    tensor = torch.tensor(rows)
-    norms = tensor.norm(dim=1, keepdim=True)
-    usable = torch.isfinite(norms) & (norms > 0)
-    unit = torch.where(usable, tensor / norms, 0.0)
-    return unit, usable[:, 0]
+def _directions(rows: NDArray[Any]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Unit rows [S, D] float32, and which of them [S] could be made so; the others are no use."""
+    directions = torch.tensor(rows).float()
+    norms = directions.norm(dim=1)
+    directions /= norms[:, None]
+    return directions, torch.isfinite(norms) & (norms > 0)
 
 
 def _nearest(
     queries: torch.Tensor, point_descriptors: NDArray[Any], count: int
 ) -> NDArray[np.int64]:
-    """Indices [Q, count] of the points with the greatest cosine, greatest first."""
-    best = torch.full((len(queries), 0), -torch.inf)
-    index = torch.empty((len(queries), 0), dtype=torch.int64)
+    """Indices [Q, count] of the points with the greatest cosine, greatest first, or `NO_POINT`."""
+    parts = queries.tensor_split(len(queries) // TILE + 1)
+    tiles = [_NearestGroups(part, count) for part in parts]
     for start in range(0, len(point_descriptors), BLOCK):
-        block, usable = _unit_rows(np.asarray(point_descriptors[start : start + BLOCK], np.float32))
-        block_best, block_index = _greatest_of_block(queries, block, usable, count)
-        best = torch.cat([best, block_best], dim=1)
-        best, chosen = _greatest(best, min(count, best.shape[1]))
-        index = torch.cat([index, block_index + start], dim=1).gather(1, chosen)
-    return np.asarray(index.numpy())
+        directions, usable = _directions(point_descriptors[start : start + BLOCK])
+        for tile in tiles:
+            tile.look_at(directions, usable, start)
+    return np.asarray(torch.cat([tile.nearest_points() for tile in tiles]).numpy())
 
 
-def _greatest_of_block(
-    queries: torch.Tensor, block: torch.Tensor, usable: torch.Tensor, count: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """The `count` greatest cosines of every query within a block, and their columns.
+class _NearestGroups:
+    """The `count` groups of successive points with the greatest cosines to some queries.
 
-    They lie in the `count` groups of columns with the greatest maxima, and maxima of groups are
-    much cheaper than a selection over whole rows.
+    The `count` points with the greatest cosines are among them, and maxima of groups are much
+    cheaper than a selection over all points.
     """
-    groups = -(-len(block) // GROUP)
-    cosines = torch.empty(len(queries), groups * GROUP)
-    torch.matmul(queries, block.T, out=cosines[:, : len(block)])
-    cosines[:, len(block) :] = -torch.inf
-    cosines[:, torch.nonzero(~usable)[:, 0]] = -torch.inf
-    grouped = cosines.view(len(queries), groups, GROUP)
-    _, best_groups = _greatest(grouped.amax(dim=2), min(count, groups))
-    best_groups = best_groups.sort(dim=1).values
-    members = grouped.gather(1, best_groups[:, :, None].expand(-1, -1, GROUP)).flatten(1)
-    best, chosen = _greatest(members, min(count, len(block)))
-    columns = best_groups.gather(1, chosen // GROUP) * GROUP + chosen % GROUP
-    # a padded column can only follow when fewer points are usable than asked for
-    return best, columns.clamp_(max=len(block) - 1)
+
+    def __init__(self, queries: torch.Tensor, count: int) -> None:
+        self._queries = queries
+        self._count = count
+        self._cosines = torch.full((len(queries), count, GROUP), NO_COSINE)
+        self._starts = torch.zeros((len(queries), count), dtype=torch.int64)
+
+    def look_at(self, directions: torch.Tensor, usable: torch.Tensor, start: int) -> None:
+        """Take in a block of points, of which `start` is the index of the first."""
+        starts = torch.arange(start, start + len(directions), GROUP)
+        cosines = torch.empty(len(self._queries), self._count + len(starts), GROUP)
+        cosines[:, : self._count] = self._cosines
+        block = cosines.flatten(1)[:, self._count * GROUP :]
+        torch.matmul(self._queries, directions.T, out=block[:, : len(directions)])
+        block[:, len(directions) :] = NO_COSINE
+        if not usable.all():
+            block[:, torch.nonzero(~usable)[:, 0]] = NO_COSINE
+
+        _, chosen = _greatest(cosines.amax(dim=2), self._count)
+        chosen = chosen.sort(dim=1).values
+        all_starts = torch.cat([self._starts, starts.expand(len(self._queries), -1)], dim=1)
+        self._starts = all_starts.gather(1, chosen)
+        self._cosines = cosines.gather(1, chosen[:, :, None].expand(-1, -1, GROUP))
+
+    def nearest_points(self) -> torch.Tensor:
+        """[Q, count] indices, greatest cosine first; `NO_POINT` where too few are usable."""
+        greatest, member = _greatest(self._cosines.flatten(1), self._count)
+        index = self._starts.gather(1, member // GROUP) + member % GROUP
+        return torch.where(greatest > NO_COSINE, index, NO_POINT)
 
 
 def _greatest(values: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -142,16 +148,15 @@ def _greatest(values: torch.Tensor, count: int) -> tuple[torch.Tensor, torch.Ten
 def _exact_distances(
     queries: torch.Tensor, point_descriptors: NDArray[Any], neighbours: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Distances [Q, k]; infinite for unusable points and for a neighbour listed twice.
+    """Distances [Q, count], infinite where there is no point.
 
     Recomputed from differences, because sqrt(2 - 2 cos) loses half of the digits near zero.
     """
     wanted, position = np.unique(neighbours, return_inverse=True)
-    unit, usable = _unit_rows(np.asarray(point_descriptors[wanted], np.float32))
-    place = torch.tensor(position.reshape(neighbours.shape))
-    distances = (queries[:, None, :] - unit[place]).norm(dim=2)
-    distances[~usable[place]] = torch.inf
-    for column in range(1, neighbours.shape[1]):
-        repeated = (place[:, :column] == place[:, column : column + 1]).any(dim=1)
-        distances[repeated, column] = torch.inf
-    return np.asarray(distances.numpy(), np.float32)
+    directions, _ = _directions(point_descriptors[wanted])
+    differences = (
+        queries[:, None, :] - directions[torch.from_numpy(position.reshape(neighbours.shape))]
+    )
+    distances = np.asarray(differences.norm(dim=2).numpy())
+    distances[neighbours == NO_POINT] = np.inf
+    return distances

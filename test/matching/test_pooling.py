@@ -43,6 +43,26 @@ def test_is_one_to_one_and_as_heavy_as_the_dense_optimum(
     np.testing.assert_allclose(weights[chosen].sum(), best, atol=1e-9)
 
 
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10_000), density=st.floats(0.05, 1.0))
+def test_neither_the_order_of_edges_nor_another_component_matters(
+    seed: int, density: float
+) -> None:
+    edges, _ = _random_graph(seed, 12, 9, density)
+    rng = np.random.default_rng(seed)
+    weights = rng.random(len(edges)).astype(np.float32)
+    others, weights_of_others = _random_graph(seed + 1, 7, 8, density)
+    order = rng.permutation(len(edges) + len(others))
+
+    together = hungarian_pooling(
+        np.concatenate([edges, others + 1000])[order],
+        np.concatenate([weights, weights_of_others])[order],
+    )
+
+    of_first = together[np.argsort(order)][: len(edges)]
+    np.testing.assert_array_equal(of_first, hungarian_pooling(edges, weights))
+
+
 def test_indices_may_be_large_and_sparse() -> None:
     edges = np.array([[10**9, 7], [10**9, 2 * 10**9], [5, 7]])
 
