@@ -37,6 +37,10 @@ class BagError(RelocalizerError):
     """A bag cannot be read, or lacks what a replay needs."""
 
 
+class MatchingError(RelocalizerError):
+    """The features of an image and the points of a map do not fit together."""
+
+
 class TransformError(RelocalizerError):
     """A transform between two frames is not known at the requested time."""
 

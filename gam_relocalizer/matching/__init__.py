@@ -1,10 +1,16 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""2D-3D matching: kNN ratio candidates, BMNet, Hungarian pooling, and a baseline."""
+"""2D-3D matching: kNN ratio candidates, networks that judge them, Hungarian pooling, baselines."""
 
-from gam_relocalizer.matching.baselines import NearestNeighbourRatio
-from gam_relocalizer.matching.bmnet import normalise_keypoints
-from gam_relocalizer.matching.gam import Gam
-from gam_relocalizer.matching.matcher import Matcher, Matches
+from gam_relocalizer.matching.bmnet import normalise_keypoints, normalised_focal_length
+from gam_relocalizer.matching.matcher import Matcher, Matches, MatchInput
+from gam_relocalizer.matching.registry import create_matcher
 
-__all__ = ['Gam', 'Matcher', 'Matches', 'NearestNeighbourRatio', 'normalise_keypoints']
+__all__ = [
+    'MatchInput',
+    'Matcher',
+    'Matches',
+    'create_matcher',
+    'normalise_keypoints',
+    'normalised_focal_length',
+]

@@ -16,9 +16,13 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from gam_relocalizer.matching.graph import MatchingNetwork
+
 if TYPE_CHECKING:
     import pycolmap
     from numpy.typing import NDArray
+
+    from gam_relocalizer.matching.graph import CandidateGraphs
 
 NORM_EPSILON = 1e-3
 FAR_DISTANCE = 10.0
@@ -92,14 +96,15 @@ class Block(nn.Module):
         return shortcut + hidden
 
 
-class BMNet(nn.Module):
+class BMNet(MatchingNetwork):
     """U-Net on keypoints, V-Net on points, E-Net on the edges between them."""
 
     def __init__(self, config: BMNetConfig | None = None) -> None:
         super().__init__()
         self.config = config or BMNetConfig()
-        self.keypoint_net = _point_net(2, self.config)
-        self.point_net = _point_net(3, self.config)
+        size = self.config.point_blocks, self.config.point_width, self.config.perceptrons
+        self.keypoint_net = point_net(2, *size)
+        self.point_net = point_net(3, *size)
         width = 2 * self.config.point_width
         self.edge_net = nn.Sequential(
             *(Block(width, width, self.config.perceptrons) for _ in range(self.config.edge_blocks)),
@@ -108,39 +113,31 @@ class BMNet(nn.Module):
             nn.Linear(width, 1),
         )
 
-    def forward(
-        self, keypoints: torch.Tensor, points: torch.Tensor, edges: torch.Tensor
-    ) -> torch.Tensor:
-        """Score the edges of graphs of equal size.
-
-        Args:
-            keypoints: [M, B, 2] normalised keypoints that have an edge.
-            points: [N, B, 3] normalised points that have an edge.
-            edges: [T, B, 2] int64 (keypoint, point).
-
-        Returns:
-            [T, B] logits; their sigmoid is the probability that an edge is a true match.
-        """
-        graph = torch.arange(edges.shape[1])
-        of_keypoints = _embed(self.keypoint_net, keypoints)[edges[..., 0], graph]
-        of_points = _embed(self.point_net, points)[edges[..., 1], graph]
+    def forward(self, graphs: CandidateGraphs) -> torch.Tensor:
+        """See `MatchingNetwork.forward`; geometry alone decides, distances do not."""
+        graph = torch.arange(graphs.edges.shape[1])
+        of_keypoints = embed(self.keypoint_net, graphs.keypoints)[graphs.edges[..., 0], graph]
+        of_points = embed(self.point_net, graphs.points)[graphs.edges[..., 1], graph]
         logits: torch.Tensor = self.edge_net(torch.cat([of_keypoints, of_points], dim=2))
         return logits[..., 0].float()
 
 
-def _embed(net: nn.Sequential, coordinates: torch.Tensor) -> torch.Tensor:
-    # bfloat16, where training uses it, is too coarse for coordinates
+def embed(net: nn.Sequential, coordinates: torch.Tensor) -> torch.Tensor:
+    """Features of coordinates, whose first layer computes in full precision.
+
+    bfloat16, where training uses it, is too coarse for coordinates.
+    """
     with torch.autocast(coordinates.device.type, enabled=False):
         features = net[0](coordinates)
     embedded: torch.Tensor = net[1:](features)
     return embedded
 
 
-def _point_net(dimensions: int, config: BMNetConfig) -> nn.Sequential:
-    widening = [32, 64][: config.point_blocks - 1]
-    constant = [config.point_width] * (config.point_blocks - len(widening))
-    widths = [dimensions, *widening, *constant]
-    return nn.Sequential(*(Block(a, b, config.perceptrons) for a, b in pairwise(widths)))
+def point_net(dimensions: int, blocks: int, width: int, perceptrons: int) -> nn.Sequential:
+    """Blocks from coordinates to 32, 64, `width`, ... features."""
+    widening = [32, 64][: blocks - 1]
+    widths = [dimensions, *widening, *[width] * (blocks - len(widening))]
+    return nn.Sequential(*(Block(a, b, perceptrons) for a, b in pairwise(widths)))
 
 
 def normalise_keypoints(
@@ -161,8 +158,13 @@ def normalise_keypoints(
     if not len(keypoints):
         return np.empty((0, 2), np.float32)
     on_plane = camera.cam_from_img(np.asarray(keypoints, np.float64))
-    scale = camera.mean_focal_length() / (1.2 * max(camera.width, camera.height))
-    return np.asarray(on_plane, np.float32).reshape(-1, 2) * np.float32(scale)
+    focal_length = np.float32(normalised_focal_length(camera))
+    return np.asarray(on_plane, np.float32).reshape(-1, 2) * focal_length
+
+
+def normalised_focal_length(camera: pycolmap.Camera) -> float:
+    """The focal length in the unit of normalised keypoints."""
+    return float(camera.mean_focal_length()) / (1.2 * max(camera.width, camera.height))
 
 
 def normalise_points(points: NDArray[np.floating]) -> NDArray[np.float32]:

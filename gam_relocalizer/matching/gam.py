@@ -1,89 +1,87 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""Geometry-Aided Matching: kNN ratio candidates, BMNet, Hungarian pooling."""
+"""Geometry-Aided Matching: kNN ratio candidates, a network that judges them, Hungarian pooling."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from gam_relocalizer.matching.bmnet import normalise_points
 from gam_relocalizer.matching.candidates import knn_ratio
-from gam_relocalizer.matching.matcher import Matches
+from gam_relocalizer.matching.graph import CandidateGraphs
+from gam_relocalizer.matching.matcher import Matches, have_finite_places
 from gam_relocalizer.matching.pooling import hungarian_pooling
-from gam_relocalizer.matching.weights import load_weights
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
-    from gam_relocalizer.matching.bmnet import BMNet
+    from gam_relocalizer.matching.graph import MatchingNetwork
+    from gam_relocalizer.matching.matcher import MatchInput
 
 NEIGHBOURS = 3
 RATIO = 0.7
 
 
 class Gam:
-    """The matcher of the paper, with its default k = 3 and r = 0.7."""
+    """The matcher of the paper, for any network; the paper's k = 3 and r = 0.7 by default."""
 
-    def __init__(self, net: BMNet, neighbours: int = NEIGHBOURS, ratio: float = RATIO) -> None:
-        """Match with a network; `neighbours` and `ratio` are those of `knn_ratio`."""
-        self._net = net.eval()
+    def __init__(
+        self,
+        network: MatchingNetwork,
+        neighbours: int = NEIGHBOURS,
+        ratio: float = RATIO,
+        *,
+        pooling: bool = True,
+        least_weight: float = 0.0,
+    ) -> None:
+        """Match with a network.
+
+        Args:
+            network: Judges the candidates.
+            neighbours: See `knn_ratio`.
+            ratio: See `knn_ratio`.
+            pooling: Whether matches are made one-to-one; without it all candidates are matches.
+            least_weight: Matches of lower weight are left out.
+        """
+        self._network = network.eval()
         self._neighbours = neighbours
         self._ratio = ratio
+        self._pooling = pooling
+        self._least_weight = least_weight
 
-    @classmethod
-    def load(cls, weights: Path | None = None) -> Gam:
-        """Load a weights file, the shipped one if no path is given.
-
-        Raises:
-            WeightsError: The file is missing, damaged or does not fit.
-        """
-        net, _ = load_weights(weights)
-        return cls(net)
-
-    def match(
-        self,
-        keypoints_normalised: NDArray[Any],
-        descriptors: NDArray[Any],
-        points: NDArray[Any],
-        point_descriptors: NDArray[Any],
-    ) -> Matches:
-        """See `Matcher.match`; the weights are BMNet's probabilities.
-
-        The pooling maximises probability times cosine of the descriptors, not probability alone.
-        """
-        candidates = knn_ratio(descriptors, point_descriptors, self._neighbours, self._ratio)
-        usable = _have_finite_places(candidates.edges, keypoints_normalised, points)
-        edges = candidates.edges[usable]
+    def match(self, given: MatchInput) -> Matches:
+        """See `Matcher.match`; the weights are the network's probabilities."""
+        candidates = knn_ratio(
+            given.descriptors, given.point_descriptors, self._neighbours, self._ratio
+        )
+        placed = have_finite_places(candidates.edges, given)
+        edges, distances = candidates.edges[placed], candidates.distances[placed]
         if not len(edges):
             return Matches.none()
-        weights = self._weigh(edges, keypoints_normalised, points)
-        # points near one line of sight are all alike to the network: among them, looks decide
-        cosines = 1.0 - candidates.distances[usable] ** 2 / 2.0
-        pooled = hungarian_pooling(edges, weights * cosines)
-        return Matches(edges[pooled, 0], edges[pooled, 1], weights[pooled])
+        weights = self._weigh(edges, distances, given)
+        kept = weights >= self._least_weight
+        if self._pooling:
+            kept &= hungarian_pooling(edges, weights)
+        return Matches(edges[kept, 0], edges[kept, 1], weights[kept])
 
     def _weigh(
-        self, edges: NDArray[np.int64], keypoints: NDArray[Any], points: NDArray[Any]
+        self, edges: NDArray[np.int64], distances: NDArray[np.float32], given: MatchInput
     ) -> NDArray[np.float32]:
         """Probabilities [T] of the edges; the network sees nothing that has no edge."""
         used_keypoints, rows = np.unique(edges[:, 0], return_inverse=True)
         used_points, columns = np.unique(edges[:, 1], return_inverse=True)
+        keypoints = np.asarray(given.keypoints[used_keypoints], np.float32)
+        graph = CandidateGraphs(
+            torch.from_numpy(keypoints)[:, None],
+            torch.from_numpy(normalise_points(given.points[used_points]))[:, None],
+            torch.from_numpy(np.stack([rows, columns], axis=1))[:, None],
+            torch.from_numpy(distances)[:, None],
+            torch.tensor([given.focal_length], dtype=torch.float32),
+        )
         with torch.inference_mode():
-            logits = self._net(
-                torch.from_numpy(np.asarray(keypoints[used_keypoints], np.float32))[:, None],
-                torch.from_numpy(normalise_points(points[used_points]))[:, None],
-                torch.from_numpy(np.stack([rows, columns], axis=1))[:, None],
-            )
-            return np.asarray(torch.sigmoid(logits[:, 0]).numpy(), np.float32)
-
-
-def _have_finite_places(
-    edges: NDArray[np.int64], keypoints: NDArray[Any], points: NDArray[Any]
-) -> NDArray[np.bool_]:
-    finite_keypoints = np.isfinite(keypoints[edges[:, 0]]).all(axis=1)
-    return np.asarray(finite_keypoints & np.isfinite(points[edges[:, 1]]).all(axis=1))
+            probabilities = torch.sigmoid(self._network(graph)[:, 0]).numpy()
+        # finite but absurd coordinates overflow
+        return np.asarray(np.nan_to_num(probabilities, nan=0.0), np.float32)

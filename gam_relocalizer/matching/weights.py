@@ -1,6 +1,6 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""Weights files of BMNet: float16 arrays in an npz, with the network's size and their origin."""
+"""Weights files: float16 arrays in an npz, with the network's name and size, and their origin."""
 
 from __future__ import annotations
 
@@ -9,20 +9,28 @@ import json
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from gam_relocalizer.errors import WeightsError
-from gam_relocalizer.matching.bmnet import BMNet, BMNetConfig
+from gam_relocalizer.matching.networks import (
+    NETWORK_NAMES,
+    create_config,
+    create_network,
+    name_of,
+)
 
-FORMAT = 1
-SHIPPED_WEIGHTS = Path(__file__).with_name('weights') / 'bmnet.npz'
+if TYPE_CHECKING:
+    from gam_relocalizer.matching.graph import MatchingNetwork
+    from gam_relocalizer.matching.networks import NetworkConfig
+
+FORMAT = 2
+SHIPPED = Path(__file__).with_name('weights')
 HEADER = 'header'
 MAX_FILE_BYTES = 100_000_000
-MAX_EDGE_BLOCKS = 64
-MAX_WIDTH = 1024
+MAX_SIZE = 1024
 
 
 @dataclass(frozen=True)
@@ -33,16 +41,18 @@ class Provenance:
         steps: Steps trained.
         planned_steps: Steps of the whole run, which sets its learning rates.
         seed: Of the run.
-        average_precision: On the synthetic validation graphs.
+        extractors: Whose descriptors the graphs were made with.
+        average_precision: On the validation graphs.
     """
 
     steps: int
     planned_steps: int
     seed: int
+    extractors: tuple[str, ...]
     average_precision: float
 
 
-def save_weights(path: Path, net: BMNet, provenance: Provenance) -> None:
+def save_weights(path: Path, net: MatchingNetwork, provenance: Provenance) -> None:
     """Write a network, under a temporary name first.
 
     Raises:
@@ -54,7 +64,7 @@ def save_weights(path: Path, net: BMNet, provenance: Provenance) -> None:
     }
     header = {
         'format': FORMAT,
-        'net': asdict(net.config),
+        'net': {'name': name_of(net.config), **asdict(net.config)},
         'provenance': asdict(provenance),
         'sha256': _digest(arrays),
     }
@@ -68,26 +78,27 @@ def save_weights(path: Path, net: BMNet, provenance: Provenance) -> None:
         raise WeightsError(f'cannot write the weights to {path}: {error}') from error
 
 
-def load_weights(path: Path | None = None) -> tuple[BMNet, Provenance]:
-    """Read a network ready for inference, the shipped one if no path is given.
+def load_weights(path: Path) -> tuple[MatchingNetwork, Provenance]:
+    """Read a network ready for inference.
 
     Raises:
         WeightsError: The file is missing, damaged, of another version or of another network.
     """
-    path = path or SHIPPED_WEIGHTS
     arrays = _read_arrays(path)
     header = _read_header(path, arrays.pop(HEADER, None))
     try:
-        config = BMNetConfig(**header['net'])
-        provenance = Provenance(**header['provenance'])
+        sizes = dict(header['net'])
+        config = create_config(sizes.pop('name'), sizes)
+        provenance = _provenance(header['provenance'])
         expected_digest = header['sha256']
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise WeightsError(
-            f'the header of the weights file {path} lacks or misnames an entry: {error}; '
-            'write the file again with `gam_relocalizer train`'
+            f'the header of the weights file {path} lacks or misnames an entry: {error!r}; known '
+            f'networks are {", ".join(NETWORK_NAMES)}; write the file again with '
+            '`gam_relocalizer train`'
         ) from error
     _check_size(path, config)
-    net = BMNet(config)
+    net = create_network(config)
     _check_shapes(path, net, arrays)
     if _digest(arrays) != expected_digest:
         raise WeightsError(
@@ -134,7 +145,7 @@ def _read_header(path: Path, stored: Any) -> dict[str, Any]:  # noqa: ANN401 - u
     try:
         header = json.loads(np.asarray(stored, np.uint8).tobytes())
         version = header['format']
-    except (TypeError, ValueError, KeyError, UnicodeDecodeError) as error:
+    except (TypeError, ValueError, KeyError, UnicodeDecodeError, RecursionError) as error:
         raise WeightsError(
             f'{path} has no header of a weights file; expected a file that '
             '`gam_relocalizer train` wrote'
@@ -147,24 +158,22 @@ def _read_header(path: Path, stored: Any) -> dict[str, Any]:  # noqa: ANN401 - u
     return dict(header)
 
 
-def _check_size(path: Path, config: BMNetConfig) -> None:
-    limits = {
-        'point_blocks': MAX_EDGE_BLOCKS,
-        'edge_blocks': MAX_EDGE_BLOCKS,
-        'point_width': MAX_WIDTH,
-        'perceptrons': MAX_EDGE_BLOCKS,
-    }
-    for name, limit in limits.items():
-        value = getattr(config, name)
-        if not isinstance(value, int) or not 1 <= value <= limit:
+def _provenance(stored: dict[str, Any]) -> Provenance:
+    return Provenance(**{**stored, 'extractors': tuple(stored['extractors'])})
+
+
+def _check_size(path: Path, config: NetworkConfig) -> None:
+    """Before a header makes the program build a network that does not fit the memory."""
+    for name, value in asdict(config).items():
+        if not isinstance(value, int) or not 1 <= value <= MAX_SIZE:
             raise WeightsError(
-                f'the weights file {path} asks for {name} = {value!r}, expected 1 to {limit}'
+                f'the weights file {path} asks for {name} = {value!r}, expected 1 to {MAX_SIZE}'
             )
 
 
-def _check_shapes(path: Path, net: BMNet, arrays: dict[str, Any]) -> None:
-    expected = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    found = {name: array.shape for name, array in arrays.items()}
+def _check_shapes(path: Path, net: MatchingNetwork, arrays: dict[str, Any]) -> None:
+    expected = {name: ('float16', tuple(value.shape)) for name, value in net.state_dict().items()}
+    found = {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
     if found == expected:
         return
     differing = sorted(

@@ -2,21 +2,27 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
-from gam_relocalizer.matching import Gam, NearestNeighbourRatio
+from gam_relocalizer.matching.baselines import NearestNeighbourRatio
+from gam_relocalizer.matching.candidates import knn_ratio
+from gam_relocalizer.matching.gam import Gam
+from gam_relocalizer.matching.matcher import MatchInput
+from gam_relocalizer.matching.registry import LEARNED_MATCHERS, create_matcher
+from gam_relocalizer.matching.weights import load_weights
 from gam_relocalizer.training.synthetic import SyntheticView, synthetic_view
 
 if TYPE_CHECKING:
-    from gam_relocalizer.matching import Matcher, Matches
+    from gam_relocalizer.matching.matcher import Matcher, Matches
 
 
 @pytest.fixture(scope='module')
-def gam() -> Gam:
-    return Gam.load()
+def gam() -> Matcher:
+    return create_matcher()
 
 
 @pytest.fixture(scope='module')
@@ -27,7 +33,17 @@ def views() -> list[SyntheticView]:
 
 
 def _match(matcher: Matcher, view: SyntheticView) -> Matches:
-    return matcher.match(view.keypoints, view.descriptors, view.points, view.point_descriptors)
+    return matcher.match(_input(view))
+
+
+def _input(view: SyntheticView) -> MatchInput:
+    return MatchInput(
+        keypoints=view.keypoints,
+        focal_length=view.focal_length,
+        descriptors=view.descriptors,
+        points=view.points,
+        point_descriptors=view.point_descriptors,
+    )
 
 
 def _true(matches: Matches, view: SyntheticView) -> np.ndarray:
@@ -35,7 +51,7 @@ def _true(matches: Matches, view: SyntheticView) -> np.ndarray:
 
 
 def test_finds_more_true_matches_than_nn_ratio_at_no_lower_precision(
-    gam: Gam, views: list[SyntheticView]
+    gam: Matcher, views: list[SyntheticView]
 ) -> None:
     found, baseline = {'true': 0, 'all': 0}, {'true': 0, 'all': 0}
     for view in views:
@@ -51,7 +67,7 @@ def test_finds_more_true_matches_than_nn_ratio_at_no_lower_precision(
     assert found['true'] / found['all'] > baseline['true'] / baseline['all']
 
 
-def test_weights_rank_true_matches_first(gam: Gam, views: list[SyntheticView]) -> None:
+def test_weights_rank_true_matches_first(gam: Matcher, views: list[SyntheticView]) -> None:
     top_true = []
     for view in views:
         matches = _match(gam, view)
@@ -61,7 +77,9 @@ def test_weights_rank_true_matches_first(gam: Gam, views: list[SyntheticView]) -
     assert np.mean(top_true) > 0.8
 
 
-def test_matches_are_one_to_one_with_weights_in_range(gam: Gam, views: list[SyntheticView]) -> None:
+def test_matches_are_one_to_one_with_weights_in_range(
+    gam: Matcher, views: list[SyntheticView]
+) -> None:
     for matcher in (gam, NearestNeighbourRatio(1.0)):
         matches = _match(matcher, views[0])
         assert len(np.unique(matches.keypoint_indices)) == len(matches)
@@ -70,88 +88,51 @@ def test_matches_are_one_to_one_with_weights_in_range(gam: Gam, views: list[Synt
         assert matches.weights.max() <= 1
 
 
-def test_same_input_same_output(gam: Gam, views: list[SyntheticView]) -> None:
-    first, second = _match(gam, views[0]), _match(Gam.load(), views[0])
+def test_same_input_same_output(gam: Matcher, views: list[SyntheticView]) -> None:
+    first, second = _match(gam, views[0]), _match(create_matcher(), views[0])
 
     np.testing.assert_array_equal(first.keypoint_indices, second.keypoint_indices)
     np.testing.assert_array_equal(first.point_indices, second.point_indices)
     np.testing.assert_array_equal(first.weights, second.weights)
 
 
-@pytest.mark.parametrize('matcher', [Gam.load(), NearestNeighbourRatio()])
-@pytest.mark.parametrize(('keypoints', 'points'), [(0, 0), (0, 9), (9, 0)])
-def test_nothing_to_match(matcher: Matcher, keypoints: int, points: int) -> None:
-    matches = matcher.match(
-        np.zeros((keypoints, 2), np.float32),
-        np.ones((keypoints, 64), np.float32),
-        np.zeros((points, 3)),
-        np.ones((points, 64), np.float16),
-    )
-
-    assert len(matches) == 0
-    assert matches.keypoint_indices.dtype == matches.point_indices.dtype == np.int64
-
-
-@pytest.mark.parametrize('matcher', [Gam.load(), NearestNeighbourRatio()])
-@pytest.mark.parametrize(('keypoints', 'points'), [(1, 1), (1, 2), (2, 1), (5, 2)])
-def test_tiny_input_gives_valid_matches(matcher: Matcher, keypoints: int, points: int) -> None:
-    rng = np.random.default_rng(0)
-
-    matches = matcher.match(
-        rng.normal(size=(keypoints, 2)),
-        rng.normal(size=(keypoints, 64)),
-        rng.normal(size=(points, 3)),
-        rng.normal(size=(points, 64)),
-    )
-
-    assert len(matches) <= min(keypoints, points)
-    assert np.isfinite(matches.weights).all()
-
-
-@pytest.mark.parametrize('matcher', [Gam.load(), NearestNeighbourRatio()])
-def test_descriptors_that_are_not_numbers_match_nothing(matcher: Matcher) -> None:
-    matches = matcher.match(
-        np.zeros((5, 2)), np.full((5, 64), np.nan), np.zeros((5, 3)), np.ones((5, 64))
-    )
-
-    assert len(matches) == 0
-
-
-def test_keypoints_and_points_that_are_not_numbers_match_nothing(
-    gam: Gam, views: list[SyntheticView]
-) -> None:
+def test_absurd_places_do_not_spoil_the_others(gam: Matcher, views: list[SyntheticView]) -> None:
     view = views[0]
     keypoints, points = view.keypoints.copy(), view.points.copy()
     keypoints[:50] = np.nan
     points[:50] = np.inf
 
-    matches = gam.match(keypoints, view.descriptors, points, view.point_descriptors)
+    matches = gam.match(replace(_input(view), keypoints=keypoints, points=points))
 
     assert len(matches) > 0
     assert matches.keypoint_indices.min() >= 50
     assert matches.point_indices.min() >= 50
 
 
-def test_identical_everything_does_not_fail(gam: Gam) -> None:
-    matches = gam.match(np.zeros((30, 2)), np.ones((30, 64)), np.zeros((30, 3)), np.ones((30, 64)))
+def test_matches_below_the_least_weight_are_left_out(views: list[SyntheticView]) -> None:
+    network, _ = load_weights(LEARNED_MATCHERS['gam'].shipped)
 
-    assert np.isfinite(matches.weights).all()
+    every = _match(Gam(network), views[0])
+    likely = _match(Gam(network, least_weight=0.5), views[0])
+
+    expected = every.weights >= 0.5
+    np.testing.assert_array_equal(likely.keypoint_indices, every.keypoint_indices[expected])
+    np.testing.assert_array_equal(likely.point_indices, every.point_indices[expected])
 
 
-def test_nearest_neighbour_ratio_by_hand() -> None:
-    point_descriptors = np.eye(3, 8)
-    descriptors = np.array([[1, 0.1, 0, 0, 0, 0, 0, 0], [1, 0.95, 0, 0, 0, 0, 0, 0]])
+def test_without_pooling_every_likely_candidate_is_a_match(views: list[SyntheticView]) -> None:
+    network, _ = load_weights(LEARNED_MATCHERS['gam'].shipped)
+    view = views[0]
+    candidates = knn_ratio(view.descriptors, view.point_descriptors)
 
-    matches = NearestNeighbourRatio(0.8).match(
-        np.zeros((2, 2)), descriptors, np.zeros((3, 3)), point_descriptors
-    )
+    matches = _match(Gam(network, pooling=False), view)
 
-    np.testing.assert_array_equal(matches.keypoint_indices, [0])
-    np.testing.assert_array_equal(matches.point_indices, [0])
+    np.testing.assert_array_equal(matches.keypoint_indices, candidates.edges[:, 0])
+    np.testing.assert_array_equal(matches.point_indices, candidates.edges[:, 1])
 
 
 def test_of_two_points_in_one_place_the_one_that_looks_right_is_matched(
-    gam: Gam, views: list[SyntheticView]
+    gam: Matcher, views: list[SyntheticView]
 ) -> None:
     view = views[1]
     others = np.random.default_rng(0).normal(size=view.point_descriptors.shape)
@@ -159,10 +140,13 @@ def test_of_two_points_in_one_place_the_one_that_looks_right_is_matched(
     count = len(view.points)
 
     matches = gam.match(
-        view.keypoints,
-        view.descriptors,
-        np.concatenate([view.points, view.points]),
-        np.concatenate([view.point_descriptors, view.point_descriptors + 0.5 * others]),
+        replace(
+            _input(view),
+            points=np.concatenate([view.points, view.points]),
+            point_descriptors=np.concatenate(
+                [view.point_descriptors, view.point_descriptors + 0.5 * others]
+            ),
+        )
     )
 
     of_original = matches.point_indices[matches.weights > 0.5] < count
