@@ -1,0 +1,286 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""Every reference image of a map as a query to the map without it.
+
+Section 'Learning from SfM Model' of the paper: the tracks tell which keypoint is which point, so a
+map brings its own labels to train a matcher on, and its own truth to measure one with.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pycolmap
+from scipy.spatial import cKDTree
+
+from gam_relocalizer.errors import ImageError, MapError, UsageError
+from gam_relocalizer.features.registry import create_extractor
+from gam_relocalizer.images import read_image
+from gam_relocalizer.mapping.progress import ignore_progress
+from gam_relocalizer.mapping.sfm import quiet_colmap
+from gam_relocalizer.scene_map import SFM, verify_files
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from gam_relocalizer.features.local import LocalExtractor
+    from gam_relocalizer.mapping.progress import Progress
+    from gam_relocalizer.scene_map import SceneMap
+
+NO_POINT = -1
+# Keypoints of the same image and extractor agree to rounding, but for a few of the faintest.
+_SAME_KEYPOINT_PX = 0.01
+_MIN_KNOWN_KEYPOINTS = 0.9
+
+
+@dataclass(frozen=True)
+class ReferenceImage:
+    """A reference image with all its features.
+
+    Attributes:
+        camera: Intrinsics.
+        keypoints: [M,2] float32 pixels, COLMAP convention.
+        descriptors: [M,D] float32, L2-normalised.
+        point_of_keypoint: [M] int64, the map's point that a keypoint observes, or `NO_POINT`.
+    """
+
+    camera: pycolmap.Camera
+    keypoints: NDArray[np.float32]
+    descriptors: NDArray[np.float32]
+    point_of_keypoint: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ReferenceImages:
+    """The reference images of a map, in its order.
+
+    Attributes:
+        scene_map: The map.
+        images: I images.
+        descriptor_sums: [N,D] float32, over the whole track of each point.
+    """
+
+    scene_map: SceneMap
+    images: tuple[ReferenceImage, ...]
+    descriptor_sums: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class LeftOutView:
+    """A reference image as a query, and what the map is without it.
+
+    Attributes:
+        image: Index of the reference image.
+        reference: Index of the one that retrieval finds in its place.
+        points: [N] int64 rising indices of the points that covisible images see.
+        point_descriptors: [N,D] float32 means over the tracks without this image, L2-normalised.
+        true_rows: [M] int64, the row of `points` that a keypoint truly observes, or `NO_POINT`.
+    """
+
+    image: int
+    reference: int
+    points: NDArray[np.int64]
+    point_descriptors: NDArray[np.float32]
+    true_rows: NDArray[np.int64]
+
+
+def read_reference_images(
+    scene_map: SceneMap, folder: Path, progress: Progress = ignore_progress
+) -> ReferenceImages:
+    """Describes the images that a map was built from once more, and reads their tracks.
+
+    Args:
+        scene_map: A map with its COLMAP model.
+        folder: The folder of images that it was built from.
+        progress: Told of the step extract.
+
+    Raises:
+        UsageError: There is no such folder.
+        MapError: The map has no COLMAP model, or one that does not fit it.
+        ImageError: An image is missing, unreadable, or not the one the map was built from.
+        WeightsError: The extractor's weights are missing or damaged.
+    """
+    if not folder.is_dir():
+        msg = (
+            f'{folder}: no such folder of images; expected the one {scene_map.path} was built from'
+        )
+        raise UsageError(msg)
+    observed = _read_observed_images(scene_map)
+    extractor = _extractor_of(scene_map)
+    images = []
+    for done, image in enumerate(observed, start=1):
+        images.append(_describe(image, folder / image.name, extractor))
+        progress('extract', done, len(observed))
+    return ReferenceImages(scene_map, tuple(images), _descriptor_sums(images, scene_map))
+
+
+def leave_out(references: ReferenceImages, image: int) -> LeftOutView:
+    """Takes an image out of its map: from the means of its points, and from retrieval.
+
+    Its keypoints stay in the triangulation of the points, as in the paper.
+    """
+    scene_map, left_out = references.scene_map, references.images[image]
+    covisible = scene_map.covisibility[[image]].indices
+    seen = [scene_map.points_seen_by(other) for other in covisible if other != image]
+    points = np.unique(np.concatenate([np.empty(0, np.int32), *seen])).astype(np.int64)
+
+    observes = np.flatnonzero(left_out.point_of_keypoint != NO_POINT)
+    observed = left_out.point_of_keypoint[observes]
+    row_of_point = np.full(len(scene_map.points), NO_POINT)
+    row_of_point[points] = np.arange(len(points))
+    true_rows = np.full(len(left_out.keypoints), NO_POINT)
+    true_rows[observes] = row_of_point[observed]
+
+    sums = references.descriptor_sums[points]
+    inside = true_rows != NO_POINT
+    np.subtract.at(sums, true_rows[inside], left_out.descriptors[inside])
+    norms = np.linalg.norm(sums, axis=1, keepdims=True)
+    return LeftOutView(
+        image=image,
+        reference=_retrieved_without(scene_map, image),
+        points=points,
+        point_descriptors=sums / np.maximum(norms, np.finfo(np.float32).tiny),
+        true_rows=true_rows,
+    )
+
+
+def _retrieved_without(scene_map: SceneMap, image: int) -> int:
+    scores = scene_map.global_descriptors @ scene_map.global_descriptors[image]
+    scores[image] = -np.inf
+    return int(np.argmax(scores))
+
+
+@dataclass(frozen=True)
+class _ObservedImage:
+    """What the COLMAP model knows of a reference image."""
+
+    name: str
+    camera: pycolmap.Camera
+    keypoints: NDArray[np.float64]
+    point_of_keypoint: NDArray[np.int64]
+
+
+def _read_observed_images(scene_map: SceneMap) -> list[_ObservedImage]:
+    """The map's images, in its order."""
+    model = _read_model(scene_map)
+    # the rows of a map follow the ids of COLMAP's points, rising
+    point_ids = np.array(sorted(model.point3D_ids()), dtype=np.uint64)
+    by_name = {image.name: image for image in model.images.values()}
+    missing = [name for name in scene_map.image_names if name not in by_name]
+    if missing:
+        msg = (
+            f'{scene_map.path / SFM}: lacks image `{missing[0]}` of the map; build it again with '
+            f'`map build`'
+        )
+        raise MapError(msg)
+    images = [by_name[name] for name in scene_map.image_names]
+    # the model owns its cameras, and is gone when its images are in use
+    cameras = {camera_id: copy(camera) for camera_id, camera in model.cameras.items()}
+    return [_observed_image(image, cameras[image.camera_id], point_ids) for image in images]
+
+
+def _observed_image(
+    image: pycolmap.Image, camera: pycolmap.Camera, point_ids: NDArray[np.uint64]
+) -> _ObservedImage:
+    observing = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
+    seen = np.array([image.point2D(int(one)).point3D_id for one in observing], dtype=np.uint64)
+    point_of_keypoint = np.full(image.num_points2D(), NO_POINT)
+    point_of_keypoint[observing] = np.searchsorted(point_ids, seen)
+    return _ObservedImage(
+        name=image.name,
+        camera=camera,
+        keypoints=np.array([point.xy for point in image.points2D]).reshape(-1, 2),
+        point_of_keypoint=point_of_keypoint,
+    )
+
+
+def _read_model(scene_map: SceneMap) -> pycolmap.Reconstruction:
+    names = [name for name in scene_map.manifest.files if name.startswith(f'{SFM}/')]
+    if not names:
+        msg = (
+            f'{scene_map.path}: has no COLMAP model ({SFM}/), which holds the tracks; '
+            f'build it again with `map build`'
+        )
+        raise MapError(msg)
+    verify_files(scene_map.path, scene_map.manifest, iter(names))
+    try:
+        with quiet_colmap():
+            model = pycolmap.Reconstruction(scene_map.path / SFM)
+    except (ValueError, RuntimeError) as err:
+        msg = f'{scene_map.path / SFM}: cannot be read as a COLMAP model: {err}'
+        raise MapError(msg) from err
+    if model.num_points3D() != len(scene_map.points):
+        msg = (
+            f'{scene_map.path / SFM}: {model.num_points3D()} points, the map has '
+            f'{len(scene_map.points)}; build it again with `map build`'
+        )
+        raise MapError(msg)
+    return model
+
+
+def _extractor_of(scene_map: SceneMap) -> LocalExtractor:
+    """The extractor that made the map, with as many keypoints as then."""
+    manifest = scene_map.manifest
+    options = manifest.build.get('options')
+    max_keypoints = options.get('max_keypoints') if isinstance(options, dict) else None
+    if not isinstance(max_keypoints, int):
+        msg = f'{scene_map.path}: its manifest does not tell `max_keypoints`; build the map again'
+        raise MapError(msg)
+    extractor = create_extractor(manifest.extractor.name, max_keypoints)
+    if extractor.identity != manifest.extractor:
+        msg = (
+            f'{scene_map.path}: its descriptors come from another extractor than here: expected '
+            f'{extractor.identity}, found {manifest.extractor}; build it again with `map build`'
+        )
+        raise MapError(msg)
+    return extractor
+
+
+def _describe(observed: _ObservedImage, file: Path, extractor: LocalExtractor) -> ReferenceImage:
+    features = extractor.extract(read_image(file))
+    same = _same_keypoints(features.keypoints, observed.keypoints)
+    known = np.count_nonzero(same < len(observed.keypoints))
+    if known < _MIN_KNOWN_KEYPOINTS * max(len(features), len(observed.keypoints)):
+        msg = (
+            f'{file}: {known} of its {len(features)} features are among the '
+            f'{len(observed.keypoints)} in the map; expected the very image that the map was '
+            f'built from'
+        )
+        raise ImageError(msg)
+    return ReferenceImage(
+        camera=observed.camera,
+        keypoints=features.keypoints,
+        descriptors=features.descriptors,
+        point_of_keypoint=np.append(observed.point_of_keypoint, NO_POINT)[same],
+    )
+
+
+def _same_keypoints(
+    keypoints: NDArray[np.floating], observed: NDArray[np.floating]
+) -> NDArray[np.int64]:
+    """For each keypoint the index of the same observed one, or their number if there is none.
+
+    Keypoints of almost equal score change places with the number of threads, and the last ones are
+    another selection. SIFT has several at one place, which the order tells apart.
+    """
+    _, same = cKDTree(observed).query(keypoints, distance_upper_bound=_SAME_KEYPOINT_PX)
+    common = min(len(keypoints), len(observed))
+    distances = np.linalg.norm(keypoints[:common] - observed[:common], axis=1)
+    in_order = np.flatnonzero(distances < _SAME_KEYPOINT_PX)
+    same[in_order] = in_order
+    return np.asarray(same, np.int64)
+
+
+def _descriptor_sums(images: Sequence[ReferenceImage], scene_map: SceneMap) -> NDArray[np.float32]:
+    shape = len(scene_map.points), scene_map.manifest.extractor.dimension
+    sums = np.zeros(shape, np.float32)
+    for image in images:
+        observes = image.point_of_keypoint != NO_POINT
+        np.add.at(sums, image.point_of_keypoint[observes], image.descriptors[observes])
+    return sums
