@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from gam_relocalizer import __version__
-from gam_relocalizer.cli import demo, localize, node, replay, train
+from gam_relocalizer.cli import demo, evaluate, localize, node, replay, train
 from gam_relocalizer.cli import map as map_commands
 from gam_relocalizer.errors import RelocalizerError, UsageError
 
@@ -33,6 +33,7 @@ app.command(
     context_settings={'allow_extra_args': True, 'ignore_unknown_options': True},
 )(node.node)
 app.command()(train.train)
+app.add_typer(evaluate.app, name='evaluate')
 app.command()(demo.demo)
 
 
