@@ -8,15 +8,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 
-from gam_relocalizer.training.synthetic import LabelledGraph, labelled_graph
+from gam_relocalizer.matching.graph import CandidateGraphs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-EDGES_PER_KEYPOINT = 2.75
+    from gam_relocalizer.training.labelled import LabelledGraph
+
 STRIDE = 64
 """Sizes are multiples of it: matrix kernels are compiled anew for every size."""
 
@@ -29,57 +31,66 @@ class GraphBatch:
         keypoints: [M, B, 2] normalised.
         points: [N, B, 3] normalised.
         edges: [T, B, 2] int64.
+        distances: [T, B].
         labels: [T, B] bool.
+        focal_lengths: [B], in the unit of the keypoints.
     """
 
     keypoints: NDArray[np.float32]
     points: NDArray[np.float32]
     edges: NDArray[np.int64]
+    distances: NDArray[np.float32]
     labels: NDArray[np.bool_]
+    focal_lengths: NDArray[np.float32]
+
+    def graphs(self) -> CandidateGraphs:
+        """What a network gets to see."""
+        return CandidateGraphs(
+            torch.from_numpy(self.keypoints),
+            torch.from_numpy(self.points),
+            torch.from_numpy(self.edges),
+            torch.from_numpy(self.distances),
+            torch.from_numpy(self.focal_lengths),
+        )
 
 
-def random_batch(
-    rng: np.random.Generator, graphs: int, keypoints: tuple[int, int], points: tuple[int, int]
-) -> GraphBatch:
-    """Draw `graphs` graphs; every second one is the mirror image of the one before.
-
-    The mirror image of a scene and of its view is as good a scene, and costs nothing to make.
-    """
-    count = max(STRIDE, _round_to_stride(np.exp(rng.uniform(*np.log(keypoints)))))
-    drawn: list[LabelledGraph] = []
-    while len(drawn) < graphs:
-        graph = labelled_graph(rng, (count, count), points)
-        drawn += [graph, mirrored(graph)]
-    return stacked(drawn[:graphs], count, rng)
-
-
-def mirrored(graph: LabelledGraph) -> LabelledGraph:
-    """The graph as a mirror shows it: left and right change places in image and scene."""
-    return replace(
-        graph,
-        keypoints=graph.keypoints * np.array([-1, 1], np.float32),
-        points=graph.points * np.array([-1, 1, 1], np.float32),
-    )
-
-
-def stacked(
-    graphs: Sequence[LabelledGraph], keypoints: int, rng: np.random.Generator
-) -> GraphBatch:
+def stacked(graphs: Sequence[LabelledGraph], rng: np.random.Generator) -> GraphBatch:
     """Bring graphs to one size: leave out random edges, repeat random edges, keypoints and points.
 
     Args:
-        graphs: Each with at most `keypoints` keypoints.
-        keypoints: M of the batch; it has 2.75 edges for each.
+        graphs: Their edges are brought to the mean number, rounded.
         rng: Chooses what is left out or repeated.
     """
+    keypoints = _round_to_stride(max(len(graph.keypoints) for graph in graphs), up=True)
     points = _round_to_stride(max(len(graph.points) for graph in graphs), up=True)
-    edges = _round_to_stride(EDGES_PER_KEYPOINT * keypoints)
-    rows_of_keypoints = [_rows(len(graph.keypoints), keypoints, rng) for graph in graphs]
-    rows_of_points = [_rows(len(graph.points), points, rng) for graph in graphs]
-    rows_of_edges = [_rows(len(graph.edges), edges, rng, shuffle=True) for graph in graphs]
-    pick = zip(graphs, rows_of_keypoints, rows_of_points, rows_of_edges, strict=True)
-    parts = [(g.keypoints[k], g.points[p], g.edges[e], g.labels[e]) for g, k, p, e in pick]
-    return GraphBatch(*(np.stack(part, axis=1) for part in zip(*parts, strict=True)))
+    edges = _round_to_stride(float(np.mean([len(graph.edges) for graph in graphs])))
+    return side_by_side([_resized(graph, keypoints, points, edges, rng) for graph in graphs])
+
+
+def side_by_side(graphs: Sequence[LabelledGraph]) -> GraphBatch:
+    """A batch of graphs that are of one size already."""
+    return GraphBatch(
+        keypoints=np.stack([graph.keypoints for graph in graphs], axis=1),
+        points=np.stack([graph.points for graph in graphs], axis=1),
+        edges=np.stack([graph.edges for graph in graphs], axis=1),
+        distances=np.stack([graph.distances for graph in graphs], axis=1),
+        labels=np.stack([graph.labels for graph in graphs], axis=1),
+        focal_lengths=np.array([graph.focal_length for graph in graphs], np.float32),
+    )
+
+
+def _resized(
+    graph: LabelledGraph, keypoints: int, points: int, edges: int, rng: np.random.Generator
+) -> LabelledGraph:
+    kept = _rows(len(graph.edges), edges, rng, shuffle=True)
+    return replace(
+        graph,
+        keypoints=graph.keypoints[_rows(len(graph.keypoints), keypoints, rng)],
+        points=graph.points[_rows(len(graph.points), points, rng)],
+        edges=graph.edges[kept],
+        distances=graph.distances[kept],
+        labels=graph.labels[kept],
+    )
 
 
 def _rows(

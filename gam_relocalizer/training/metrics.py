@@ -11,14 +11,15 @@ import numpy as np
 import torch
 
 from gam_relocalizer.matching.pooling import hungarian_pooling
+from gam_relocalizer.training.batches import side_by_side
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from gam_relocalizer.matching.bmnet import BMNet
-    from gam_relocalizer.training.synthetic import LabelledGraph
+    from gam_relocalizer.matching.graph import MatchingNetwork
+    from gam_relocalizer.training.labelled import LabelledGraph
 
 CONFIDENT = 0.5
 
@@ -42,16 +43,12 @@ class MatchMetrics:
     average_precision: float
 
 
-def evaluate(net: BMNet, graphs: Sequence[LabelledGraph]) -> MatchMetrics:
+def evaluate(net: MatchingNetwork, graphs: Sequence[LabelledGraph]) -> MatchMetrics:
     """Metrics of a network on labelled graphs."""
     rows = []
     with torch.inference_mode():
         for graph in graphs:
-            logits = net(
-                torch.from_numpy(graph.keypoints)[:, None],
-                torch.from_numpy(graph.points)[:, None],
-                torch.from_numpy(graph.edges)[:, None],
-            )
+            logits = net(side_by_side([graph]).graphs())
             rows.append(_of_graph(graph, torch.sigmoid(logits[:, 0]).numpy()))
     return MatchMetrics(*(float(value) for value in np.mean(rows, axis=0)))
 

@@ -6,11 +6,8 @@ A random scene is seen by a query camera and by mapping cameras around it. Rays 
 cameras make the map's points (noisy along the ray as triangulated points are, some of them wrong,
 some of them doubled), projections of those visible in the query plus rays of the query itself make
 its keypoints. Descriptors are drawn around shared words so that repeated elements look alike. The
-candidates then come from the kNN ratio matching of inference, so negatives are as hard as there.
-
-An edge is true when its point, as the map has it, projects within 1 % of the longer side of the
-image from its keypoint. This is the truth that a pose solver sees: a double of the point, or a
-point that is hidden but on the same line of sight, is no error of geometry.
+candidates then come from the kNN ratio matching of inference, so negatives are as hard as there. An
+edge is true when its point, as the map has it, projects close enough to its keypoint.
 """
 
 from __future__ import annotations
@@ -21,17 +18,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gam_relocalizer.matching.bmnet import normalise_points
-from gam_relocalizer.matching.candidates import knn_ratio
+from gam_relocalizer.training.labelled import meet
 from gam_relocalizer.training.scenes import PATTERN, Hits, Scene, cast, random_scene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 DIMENSION = 64
-TRUE_ERROR = 0.01 * 1.0 / 1.2
-"""Reprojection error below which an edge is true, in normalised keypoint units."""
-MIN_TRUE_EDGES = 12
+MIN_SEEN = 24
+"""Points of the map that a query sees at least."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +35,7 @@ class SyntheticView:
 
     Attributes:
         keypoints: [M, 2] normalised keypoints.
+        focal_length: In the unit of the keypoints.
         descriptors: [M, D] of the keypoints.
         points: [N, 3] in the frame of a mapping camera near the query, any unit.
         point_descriptors: [N, D] of the points.
@@ -47,6 +43,7 @@ class SyntheticView:
     """
 
     keypoints: NDArray[np.float32]
+    focal_length: float
     descriptors: NDArray[np.float32]
     points: NDArray[np.float32]
     point_descriptors: NDArray[np.float32]
@@ -54,25 +51,7 @@ class SyntheticView:
 
     def labels(self, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which of the edges [T, 2] are true."""
-        offsets = self.keypoints[edges[:, 0]] - self.projections[edges[:, 1]]
-        return np.asarray(np.linalg.norm(offsets, axis=1) < TRUE_ERROR)
-
-
-@dataclass(frozen=True)
-class LabelledGraph:
-    """Input of BMNet and the labels of its edges.
-
-    Attributes:
-        keypoints: [M, 2] normalised, only those with an edge.
-        points: [N, 3] normalised, only those with an edge.
-        edges: [T, 2] int64.
-        labels: [T] bool.
-    """
-
-    keypoints: NDArray[np.float32]
-    points: NDArray[np.float32]
-    edges: NDArray[np.int64]
-    labels: NDArray[np.bool_]
+        return meet(edges, self.keypoints, self.projections)
 
 
 @dataclass(frozen=True)
@@ -93,11 +72,16 @@ class _Camera:
         """[N, 3] points in the frame of the camera."""
         return np.asarray(self.world_from_camera.inv().apply(points - self.position))
 
+    @property
+    def focal_length(self) -> float:
+        """In the unit of normalised keypoints."""
+        return 1.0 / (2.4 * float(self.extent.max()))
+
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """[N, 2] normalised keypoint coordinates, nan behind the camera."""
         in_camera = self.from_scene(points)
         depth = np.where(in_camera[:, 2] > 1e-3, in_camera[:, 2], np.nan)
-        return np.asarray(in_camera[:, :2] / depth[:, None] / (2.4 * self.extent.max()))
+        return np.asarray(in_camera[:, :2] / depth[:, None] * self.focal_length)
 
 
 @dataclass(frozen=True)
@@ -124,26 +108,6 @@ class _Elements:
         return _Elements(self.positions[index], self.looks[index], self.tolerance[index])
 
 
-def labelled_graph(
-    rng: np.random.Generator, keypoints: tuple[int, int], points: tuple[int, int]
-) -> LabelledGraph:
-    """Draw graphs until one has enough true edges to learn a pose from."""
-    while True:
-        view = synthetic_view(rng, keypoints, points)
-        candidates = knn_ratio(view.descriptors, view.point_descriptors)
-        labels = view.labels(candidates.edges)
-        if labels.sum() >= MIN_TRUE_EDGES:
-            break
-    used_keypoints, rows = np.unique(candidates.edges[:, 0], return_inverse=True)
-    used_points, columns = np.unique(candidates.edges[:, 1], return_inverse=True)
-    return LabelledGraph(
-        keypoints=view.keypoints[used_keypoints],
-        points=normalise_points(view.points[used_points]),
-        edges=np.stack([rows, columns], axis=1),
-        labels=labels,
-    )
-
-
 def synthetic_view(
     rng: np.random.Generator,
     keypoints: tuple[int, int] = (200, 1500),
@@ -165,7 +129,7 @@ def synthetic_view(
         cameras = _mapping_cameras(scene, query, rng)
         elements, origins = _map_elements(scene, cameras, looks, wanted_points, rng)
         seen = np.flatnonzero(_visible(scene, query, elements))
-        if len(seen) >= 2 * MIN_TRUE_EDGES:
+        if len(seen) >= MIN_SEEN:
             break
     positions, point_descriptors = _triangulated(elements, origins, looks, rng)
 
@@ -181,6 +145,7 @@ def synthetic_view(
     unit = np.exp(rng.normal(0, 1))
     return SyntheticView(
         keypoints=(true_places + rng.normal(0, noise, true_places.shape)).astype(np.float32),
+        focal_length=query.focal_length,
         descriptors=descriptors,
         points=(unit * reference.from_scene(positions)).astype(np.float32),
         point_descriptors=point_descriptors,
@@ -354,9 +319,9 @@ def _near_doubles(
 
 def _visible(scene: Scene, camera: _Camera, elements: _Elements) -> NDArray[np.bool_]:
     """Which elements lie inside the image and before all else on their line of sight."""
-    projections = camera.project(elements.positions) * 2.4 * camera.extent.max()
+    projections = camera.project(elements.positions) / camera.focal_length
     with np.errstate(invalid='ignore'):
-        visible = (np.abs(projections) < camera.extent).all(axis=1)
+        visible = np.asarray((np.abs(projections) < camera.extent).all(axis=1))
     rays = elements.positions[visible] - camera.position
     hits = cast(scene, camera.position, rays)
     slack = elements.tolerance[visible] / np.linalg.norm(rays, axis=1)

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
@@ -12,9 +14,12 @@ from hypothesis import strategies as st
 from gam_relocalizer.matching.bmnet import (
     BMNet,
     BMNetConfig,
+    embed,
     normalise_keypoints,
     normalise_points,
+    normalised_focal_length,
 )
+from gam_relocalizer.matching.graph import CandidateGraphs
 
 SMALL = BMNetConfig(point_blocks=3, edge_blocks=2, point_width=8)
 
@@ -24,12 +29,27 @@ def _net(config: BMNetConfig = SMALL) -> BMNet:
     return BMNet(config).eval()
 
 
-def _graphs(batch: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _graphs(batch: int, seed: int = 0) -> CandidateGraphs:
     generator = torch.Generator().manual_seed(seed)
-    keypoints = torch.randn(20, batch, 2, generator=generator)
-    points = torch.randn(30, batch, 3, generator=generator)
     columns = [torch.randint(limit, (50, batch), generator=generator) for limit in (20, 30)]
-    return keypoints, points, torch.stack(columns, dim=2)
+    return CandidateGraphs(
+        keypoints=torch.randn(20, batch, 2, generator=generator),
+        points=torch.randn(30, batch, 3, generator=generator),
+        edges=torch.stack(columns, dim=2),
+        distances=torch.rand(50, batch, generator=generator),
+        focal_lengths=torch.ones(batch),
+    )
+
+
+def _one(graphs: CandidateGraphs, index: int) -> CandidateGraphs:
+    one = slice(index, index + 1)
+    return CandidateGraphs(
+        graphs.keypoints[:, one],
+        graphs.points[:, one],
+        graphs.edges[:, one],
+        graphs.distances[:, one],
+        graphs.focal_lengths[one],
+    )
 
 
 def test_default_is_the_published_size() -> None:
@@ -41,45 +61,90 @@ def test_default_is_the_published_size() -> None:
 
 
 def test_graphs_of_a_batch_do_not_influence_each_other() -> None:
-    keypoints, points, edges = _graphs(batch=3)
+    graphs = _graphs(batch=3)
 
-    together = _net()(keypoints, points, edges)
+    together = _net()(graphs)
 
+    assert together.shape == (50, 3)
     for i in range(3):
-        one = slice(i, i + 1)
-        alone = _net()(keypoints[:, one], points[:, one], edges[:, one])
-        torch.testing.assert_close(together[:, one], alone)
+        torch.testing.assert_close(together[:, i : i + 1], _net()(_one(graphs, i)))
 
 
 def test_order_of_points_and_edges_does_not_matter() -> None:
-    keypoints, points, edges = _graphs(batch=1)
+    graphs = _graphs(batch=1)
     order = torch.randperm(30, generator=torch.Generator().manual_seed(1))
     place = torch.argsort(order)
     edge_order = torch.randperm(50, generator=torch.Generator().manual_seed(2))
-    renamed = torch.stack([edges[..., 0], place[edges[..., 1]]], dim=2)[edge_order]
+    renamed = torch.stack([graphs.edges[..., 0], place[graphs.edges[..., 1]]], dim=2)
 
-    shuffled = _net()(keypoints, points[order], renamed)
+    shuffled = _net()(replace(graphs, points=graphs.points[order], edges=renamed[edge_order]))
 
-    torch.testing.assert_close(
-        shuffled, _net()(keypoints, points, edges)[edge_order], rtol=1e-4, atol=1e-4
-    )
+    torch.testing.assert_close(shuffled, _net()(graphs)[edge_order], rtol=1e-4, atol=1e-4)
+
+
+def test_geometry_alone_decides() -> None:
+    graphs = _graphs(batch=2)
+    other = replace(graphs, distances=graphs.distances + 1, focal_lengths=torch.full((2,), 0.3))
+
+    assert torch.equal(_net()(other), _net()(graphs))
+
+
+def test_both_ends_of_an_edge_count() -> None:
+    graphs = _graphs(batch=1)
+    before = _net()(graphs)
+
+    for moved in (
+        replace(graphs, keypoints=graphs.keypoints.flip(0)),
+        replace(graphs, points=graphs.points.flip(0)),
+    ):
+        assert not torch.allclose(_net()(moved), before)
 
 
 def test_every_weight_learns() -> None:
     net = _net()
 
-    net(*_graphs(batch=2)).square().sum().backward()
+    net(_graphs(batch=2)).square().sum().backward()
 
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in net.parameters())
 
 
+def test_close_coordinates_are_told_apart_in_bfloat16() -> None:
+    # 1 and 1.001 are the same number in bfloat16
+    keypoints = torch.tensor([[1.0, 1.0], [1.001, 1.0], [0.0, 0.5], [0.3, 0.0]])[:, None]
+    net = _net()
+
+    with torch.autocast('cpu', torch.bfloat16):
+        features = embed(net.keypoint_net, keypoints)
+
+    assert not torch.equal(features[0], features[1])
+
+
 def test_a_single_edge_gets_a_finite_logit() -> None:
     logits = _net()(
-        torch.zeros(1, 1, 2), torch.ones(1, 1, 3), torch.zeros(1, 1, 2, dtype=torch.int64)
+        CandidateGraphs(
+            torch.zeros(1, 1, 2),
+            torch.ones(1, 1, 3),
+            torch.zeros(1, 1, 2, dtype=torch.int64),
+            torch.ones(1, 1),
+            torch.ones(1),
+        )
     )
 
     assert logits.shape == (1, 1)
     assert torch.isfinite(logits).all()
+
+
+def test_the_focal_length_is_in_the_unit_of_the_keypoints() -> None:
+    camera = pycolmap.Camera(
+        model='PINHOLE', width=480, height=640, params=[510.0, 490.0, 250.0, 300.0]
+    )
+    pixels = np.array([[250.0 + 510.0, 300.0], [250.0, 300.0 + 490.0]])
+
+    # one focal length aside is a direction of 45 degrees
+    np.testing.assert_allclose(
+        normalise_keypoints(pixels, camera), normalised_focal_length(camera) * np.eye(2), atol=1e-6
+    )
+    assert normalised_focal_length(camera) == pytest.approx(500 / (1.2 * 640))
 
 
 def test_keypoints_of_a_centred_pinhole_are_normalised_as_published() -> None:

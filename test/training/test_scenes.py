@@ -2,10 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 
 from gam_relocalizer.training.scenes import KINDS, Scene, cast
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 def _two_walls() -> Scene:
@@ -42,7 +47,9 @@ def test_a_ray_passes_behind_a_surface_that_ends() -> None:
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_every_kind_has_surfaces_with_square_corners_around_free_space(kind) -> None:  # noqa: ANN001
+def test_every_kind_has_surfaces_with_square_corners_around_free_space(
+    kind: Callable[[np.random.Generator], Scene],
+) -> None:
     for seed in range(5):
         scene = kind(np.random.default_rng(seed))
 
