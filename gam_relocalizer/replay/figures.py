@@ -83,9 +83,7 @@ def draw_trajectory(axes: Axes, rows: Sequence[Row], scene_map: SceneMap) -> Non
     """Map points, reference cameras, fixes with their covariances, and the truth, from above."""
     view = View.from_above(scene_map)
     points = view.of(_thinned(scene_map.points))
-    cameras = view.of(
-        np.array([pose.tgt_origin_in_src() for pose in scene_map.camera_from_map])
-    )
+    cameras = view.of(np.array([pose.tgt_origin_in_src() for pose in scene_map.camera_from_map]))
     fixes = [row.robot_pose for row in rows if row.robot_pose is not None]
     positions = view.of(np.array([fix.map_from_base.translation for fix in fixes]))
     truth = view.of(np.array([row.truth.translation for row in rows if row.truth is not None]))
@@ -200,9 +198,9 @@ def draw_matches(axes: Axes, illustration: Illustration, scene_map: SceneMap) ->
     # the extent puts pixel centres at +0.5, where COLMAP has them
     axes.imshow(image, cmap='gray', vmin=0, vmax=255, extent=(0, width, height, 0))
     keypoints = np.asarray(estimate.inlier_keypoints, dtype=float)
-    in_camera = np.array([
-        estimate.camera_from_map * point for point in scene_map.points[estimate.inlier_points]
-    ]).reshape(-1, 3)
+    in_camera = np.array(
+        [estimate.camera_from_map * point for point in scene_map.points[estimate.inlier_points]]
+    ).reshape(-1, 3)
     reprojected = np.asarray(camera.img_from_cam(in_camera)).reshape(-1, 2)
     residuals = np.stack([keypoints, reprojected]).transpose(2, 0, 1)
     axes.plot(*residuals, '-', color=REPROJECTED, linewidth=0.8)

@@ -55,9 +55,7 @@ _LOG = logging.getLogger(__name__)
 class Localizes(Protocol):
     """What a replay needs of a localizer."""
 
-    def localize(
-        self, image: NDArray[np.uint8], camera: pycolmap.Camera
-    ) -> LocalizationResult:
+    def localize(self, image: NDArray[np.uint8], camera: pycolmap.Camera) -> LocalizationResult:
         """Finds the camera's pose; always a result."""
 
 
@@ -216,9 +214,7 @@ def _add_truth(truth: TransformTree, message: BagMessage, options: ReplayOptions
             f'they can be compared in one frame only (--map-frame)'
         )
         raise BagError(msg)
-    truth.add(
-        frame, _truth_frame(options), pose_in(message), message.stamp_ns, static=False
-    )
+    truth.add(frame, _truth_frame(options), pose_in(message), message.stamp_ns, static=False)
 
 
 class _Transforms:

@@ -89,26 +89,28 @@ def write_report(folder: Path, report: Report) -> None:
 def report_html(report: Report) -> str:
     """The report as an HTML page without scripts and without anything to load."""
     title = escape(report.title)
-    return '\n'.join([
-        '<!DOCTYPE html>',
-        '<html lang="en">',
-        '<head>',
-        '<meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{title}</title>',
-        f'<style>{_STYLE}</style>',
-        '</head>',
-        '<body>',
-        f'<h1>{title}</h1>',
-        *_numbers(report),
-        *_figures(report),
-        *_statuses(report),
-        *_attempts(report),
-        *_facts(report),
-        '</body>',
-        '</html>',
-        '',
-    ])
+    return '\n'.join(
+        [
+            '<!DOCTYPE html>',
+            '<html lang="en">',
+            '<head>',
+            '<meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f'<title>{title}</title>',
+            f'<style>{_STYLE}</style>',
+            '</head>',
+            '<body>',
+            f'<h1>{title}</h1>',
+            *_numbers(report),
+            *_figures(report),
+            *_statuses(report),
+            *_attempts(report),
+            *_facts(report),
+            '</body>',
+            '</html>',
+            '',
+        ]
+    )
 
 
 def length_text(length: float, unit: str) -> str:
@@ -147,9 +149,7 @@ def headline_numbers(report: Report) -> dict[str, str]:
         numbers['median error'] = (
             f'{length_text(position.median, report.unit)}, {rotation.median:.2f}°'
         )
-        numbers['largest error'] = (
-            f'{length_text(position.max, report.unit)}, {rotation.max:.2f}°'
-        )
+        numbers['largest error'] = f'{length_text(position.max, report.unit)}, {rotation.max:.2f}°'
     if summary.total_milliseconds:
         time = summary.total_milliseconds
         numbers['time per attempt'] = f'{time.median:.0f} ms (95 %: {time.p95:.0f} ms)'
