@@ -17,6 +17,7 @@ from rich.progress import track
 from rich.table import Table
 
 from gam_relocalizer.cameras import parse_camera
+from gam_relocalizer.cli.options import DEFAULT_MATCHER, MatcherOption, WeightsOption
 from gam_relocalizer.errors import ImageError, UsageError
 from gam_relocalizer.geometry import (
     pose_error,
@@ -63,20 +64,22 @@ def localize(
     truth: Annotated[
         Path | None, typer.Option(help='True poses in the form of OUT; prints the errors.')
     ] = None,
+    matcher: MatcherOption = DEFAULT_MATCHER,
+    weights: WeightsOption = None,
 ) -> None:
     """Localize images in a map; the poses are camera_from_map.
 
     An image of a folder is named by its path relative to the folder, a single image by its file
     name. Images that are refused are no failure of the command: their reasons are in JSONL.
     """
-    from gam_relocalizer.localization.localizer import Localizer
+    from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
 
     parsed_camera = parse_camera(camera)
     files = _named_files(images)
     true_poses = None if truth is None else read_poses(truth)
     for output in filter(None, (out, jsonl)):
         _prepare_output(output)
-    localizer = Localizer.load(map_path)
+    localizer = Localizer.load(map_path, LocalizerOptions(matcher=matcher, weights=weights))
     queries = [
         Query(name, _localize_file(localizer, file, parsed_camera))
         for name, file in track(files.items(), description='localizing', transient=True)

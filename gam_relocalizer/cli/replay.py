@@ -14,10 +14,12 @@ from rich.progress import Progress
 from rich.table import Table
 
 from gam_relocalizer.cameras import format_camera, parse_camera
+from gam_relocalizer.cli.options import DEFAULT_MATCHER, MatcherOption, WeightsOption
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from gam_relocalizer.localization.localizer import LocalizerOptions
     from gam_relocalizer.replay.replay import ReplayOptions
     from gam_relocalizer.replay.report import Report
     from gam_relocalizer.replay.result import Attempt, Replay
@@ -56,12 +58,14 @@ def replay(  # noqa: PLR0913 - the options of the command
     image_is_rectified: Annotated[
         bool, typer.Option('--image-is-rectified', help='Use P of the CameraInfo, no distortion.')
     ] = False,
+    matcher: MatcherOption = DEFAULT_MATCHER,
+    weights: WeightsOption = None,
 ) -> None:
     """Localize the images of a bag as the node would, and report on it.
 
     Attempts that are refused are no failure of the command: their reasons are in the report.
     """
-    from gam_relocalizer.localization.localizer import Localizer
+    from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
     from gam_relocalizer.replay.replay import ReplayOptions, replay_bag
     from gam_relocalizer.replay.report import Report, write_report
     from gam_relocalizer.replay.summary import row_of
@@ -82,13 +86,14 @@ def replay(  # noqa: PLR0913 - the options of the command
         truth_topic=truth_topic,
         image_is_rectified=image_is_rectified,
     )
+    localizer_options = LocalizerOptions(matcher=matcher, weights=weights)
     with output_folder(out) as folder:
-        localizer = Localizer.load(map_path)
+        localizer = Localizer.load(map_path, localizer_options)
         scene_map = localizer.scene_map
         with _progress(scene_map) as progress:
             replayed = replay_bag(bag, localizer, options, progress)
         rows = [row_of(attempt) for attempt in replayed.attempts]
-        facts = _facts(bag, scene_map, options, replayed)
+        facts = _facts(bag, scene_map, options, replayed) | _matcher_facts(localizer_options)
         report = Report(
             title=f'Replay of {bag.resolve().name}',
             rows=rows,
@@ -137,6 +142,13 @@ def _facts(
         'map_frame': options.map_frame,
         'camera': None if options.camera is None else format_camera(options.camera),
         'image_is_rectified': options.image_is_rectified,
+    }
+
+
+def _matcher_facts(options: LocalizerOptions) -> dict[str, Any]:
+    return {
+        'matcher': options.matcher,
+        'weights': None if options.weights is None else options.weights.resolve().name,
     }
 
 

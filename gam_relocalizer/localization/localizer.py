@@ -40,7 +40,9 @@ from gam_relocalizer.localization.verdict import (
     judge,
     judge_rival,
 )
-from gam_relocalizer.matching.bmnet import normalise_keypoints
+from gam_relocalizer.matching.bmnet import normalise_keypoints, normalised_focal_length
+from gam_relocalizer.matching.matcher import MatchInput
+from gam_relocalizer.matching.registry import DEFAULT_MATCHER, create_matcher
 from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
@@ -71,7 +73,9 @@ class LocalizerOptions:
         max_scenes: Scenes tried before giving up.
         enough_inliers: An accepted pose with so many inliers ends the search (early stop), but for
             scenes that look as alike.
-        max_keypoints: Local features taken from the image, when the localizer is loaded by name.
+        max_keypoints: Local features taken from the image, when the localizer is loaded.
+        matcher: One of `MATCHER_NAMES`, when the localizer is loaded.
+        weights: Of a learned matcher instead of the shipped ones, when the localizer is loaded.
         pose: How poses are searched.
         verdict: What a pose must show.
     """
@@ -81,6 +85,8 @@ class LocalizerOptions:
     max_scenes: int = 5
     enough_inliers: int = 200
     max_keypoints: int = DEFAULT_MAX_KEYPOINTS
+    matcher: str = DEFAULT_MATCHER
+    weights: Path | None = None
     pose: PoseOptions = field(default_factory=PoseOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
 
@@ -109,14 +115,13 @@ class Localizer:
 
     @classmethod
     def load(cls, map_path: Path, options: LocalizerOptions | None = None) -> Localizer:
-        """Loads a map, the extractor that it names and the matcher with its shipped weights.
+        """Loads a map, the extractor that it names and the matcher that the options name.
 
         Raises:
             MapError: The map is damaged, or made with an extractor that is not available here.
-            WeightsError: Weights are missing or damaged.
+            UsageError: The matcher is unknown, or weights are given to one that has none.
+            WeightsError: Weights are missing, damaged, or made for other descriptors.
         """
-        from gam_relocalizer.matching.gam import Gam
-
         options = options or LocalizerOptions()
         scene_map = load_map(map_path)
         name = scene_map.manifest.extractor.name
@@ -126,8 +131,9 @@ class Localizer:
                 f'{", ".join(EXTRACTOR_NAMES)}; build the map again with one of them'
             )
             raise MapError(msg)
+        matcher = create_matcher(options.matcher, weights=options.weights, extractor=name)
         extractor = create_extractor(name, options.max_keypoints)
-        return cls(scene_map, extractor, Gam.load(), options)
+        return cls(scene_map, extractor, matcher, options)
 
     @property
     def scene_map(self) -> SceneMap:
@@ -135,7 +141,7 @@ class Localizer:
         return self._scene_map
 
     def with_options(self, options: LocalizerOptions) -> Localizer:
-        """The same map and networks under other options (`max_keypoints` stays as loaded)."""
+        """The same map and networks under other options; what was for loading changes nothing."""
         return Localizer(self._scene_map, self._extractor, self._matcher, options)
 
     def localize(self, image: NDArray[np.uint8], camera: pycolmap.Camera) -> LocalizationResult:
@@ -240,13 +246,16 @@ class Localizer:
         return judge(estimate, points, kept, self._options.verdict)
 
     def _match(self, scene: Scene, features: LocalFeatures, camera: pycolmap.Camera) -> Matches:
-        return self._matcher.match(
-            normalise_keypoints(features.keypoints, camera),
-            features.descriptors,
-            # the matcher wants points as a camera near the query sees them
-            self._scene_map.camera_from_map[scene.image] * self._scene_map.points[scene.points],
-            self._scene_map.descriptors[scene.points],
+        # the matcher wants points as a camera near the query sees them
+        reference_from_map = self._scene_map.camera_from_map[scene.image]
+        given = MatchInput(
+            keypoints=normalise_keypoints(features.keypoints, camera),
+            focal_length=normalised_focal_length(camera),
+            descriptors=features.descriptors,
+            points=reference_from_map * self._scene_map.points[scene.points],
+            point_descriptors=self._scene_map.descriptors[scene.points],
         )
+        return self._matcher.match(given)
 
     def _estimate(
         self,

@@ -12,7 +12,6 @@ from __future__ import annotations
 import traceback
 from dataclasses import replace
 from functools import wraps
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
@@ -105,9 +104,7 @@ class RelocalizerNode(LifecycleNode):
         self._session = Session(self, self._settings, self._worker, self._outputs)
         self.get_logger().info(f'active: one attempt each {self._settings.period:g} s')
         outcome = super().on_activate(state)  # publishers are silent before
-        header = Header(
-            stamp=self.get_clock().now().to_msg(), frame_id=self._settings.map_frame
-        )
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._settings.map_frame)
         self._outputs.publish_map_points(header, self._worker.scene_map.points)
         return outcome
 
@@ -146,9 +143,7 @@ class RelocalizerNode(LifecycleNode):
             raise UsageError(msg)
         if self._settings.torch_threads:
             torch.set_num_threads(self._settings.torch_threads)
-        localizer = Localizer.load(
-            Path(self._settings.map).expanduser(), self._settings.localizer_options()
-        )
+        localizer = Localizer.load(self._settings.path('map'), self._settings.localizer_options())
         self._introduce(localizer.scene_map)
         return Worker(localizer, self._worker_done.trigger)
 
@@ -157,8 +152,8 @@ class RelocalizerNode(LifecycleNode):
         manifest, log = scene_map.manifest, self.get_logger()
         log.info(
             f'map {scene_map.path} ({manifest.map_id}): {scene_map.num_images} images, '
-            f'{len(scene_map.points)} points; extractor {manifest.extractor.name}; networks on the '
-            f'CPU with {torch.get_num_threads()} threads'
+            f'{len(scene_map.points)} points; extractor {manifest.extractor.name}, matcher '
+            f'{self._settings.matcher}; networks on the CPU with {torch.get_num_threads()} threads'
         )
         if manifest.frame.metric:
             log.info(f'the map is metric: {manifest.frame.source}')

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -16,6 +17,7 @@ from gam_relocalizer.geometry import rigid3d_from
 from gam_relocalizer.localization.localizer import LocalizerOptions
 from gam_relocalizer.localization.robot_pose import CovarianceMode, CovarianceOptions
 from gam_relocalizer.localization.verdict import VerdictOptions
+from gam_relocalizer.matching.registry import MATCHER_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -139,6 +141,17 @@ class NodeParameters:
         bounds=(100, 20_000),
         fixed=True,
     )
+    matcher: str = _parameter(
+        _LOCALIZER.matcher,
+        'What matches the features of an image with the points of the map.',
+        choices=MATCHER_NAMES,
+        fixed=True,
+    )
+    weights: str = _parameter(
+        '',
+        'Weights file of the matcher, such as one fine-tuned on the map; empty: the shipped one.',
+        fixed=True,
+    )
     min_inliers: int = _parameter(
         _VERDICT.min_inliers, 'Least number of inliers of a fix.', bounds=(4, 100_000)
     )
@@ -226,14 +239,33 @@ class NodeParameters:
         x, y, z, qx, qy, qz, qw = numbers
         return rigid3d_from((qw, qx, qy, qz), (x, y, z))
 
+    def path(self, name: str) -> Path:
+        """A parameter as the path of a file; `~` is a home folder.
+
+        Raises:
+            UsageError: Nobody knows that home folder.
+        """
+        text = getattr(self, name)
+        try:
+            return Path(text).expanduser()
+        except RuntimeError as err:
+            msg = f'parameter `{name}` is `{text}`: {err} Write the whole path, from / on'
+            raise UsageError(msg) from err
+
     def localizer_options(self) -> LocalizerOptions:
-        """What of them concerns the localizer."""
+        """What of them concerns the localizer.
+
+        Raises:
+            UsageError: See `path`.
+        """
         return LocalizerOptions(
             retrieved_images=self.retrieved_images,
             scene_images=self.scene_images,
             max_scenes=self.max_scenes,
             enough_inliers=self.enough_inliers,
             max_keypoints=self.max_keypoints,
+            matcher=self.matcher,
+            weights=self.path('weights') if self.weights else None,
             verdict=VerdictOptions(
                 min_inliers=self.min_inliers,
                 min_inlier_ratio=self.min_inlier_ratio,

@@ -15,7 +15,13 @@ from typer.testing import CliRunner
 
 from gam_relocalizer.cameras import format_camera
 from gam_relocalizer.cli.main import app
-from gam_relocalizer.errors import CameraError, MapError, PosesFileError, UsageError
+from gam_relocalizer.errors import (
+    CameraError,
+    MapError,
+    PosesFileError,
+    UsageError,
+    WeightsError,
+)
 from gam_relocalizer.geometry import pose_error, read_poses, rigid3d_from, write_poses
 
 if TYPE_CHECKING:
@@ -126,6 +132,17 @@ def test_single_files_are_named_by_their_file_name(
     assert again['b.png'].matrix().tobytes() == before['left/b.png'].matrix().tobytes()
 
 
+def test_matcher_is_the_one_named(run: Run, tiny_place: TinyPlace, tmp_path: Path) -> None:
+    out = tmp_path / 'poses.txt'
+    image = run.images / GOOD[0]
+    called = CliRunner().invoke(
+        app, command(tiny_place, image, '--out', out, '--matcher', 'nn-cross')
+    )
+    assert called.exit_code == 0
+    camera_from_map, (_, truth) = read_poses(out)[GOOD[0]], tiny_place.queries[0]
+    assert pose_error(camera_from_map, truth).position < 0.05
+
+
 def test_nothing_accepted_leaves_an_empty_file_and_exit_code_zero(
     run: Run, tiny_place: TinyPlace, tmp_path: Path
 ) -> None:
@@ -142,6 +159,9 @@ def test_nothing_accepted_leaves_an_empty_file_and_exit_code_zero(
         ({'--camera': 'PINHOLE 640 480'}, CameraError),
         ({'--truth': 'nowhere.txt'}, PosesFileError),
         ({'--out': '.'}, UsageError),
+        ({'--matcher': 'best'}, UsageError),
+        ({'--matcher': 'nn-cross', '--weights': 'tuned.npz'}, UsageError),
+        ({'--weights': 'nowhere.npz'}, WeightsError),
     ],
 )
 def test_unusable_arguments_are_errors_and_write_nothing(

@@ -11,7 +11,7 @@ from recorded_drive import KnowingLocalizer, write_bag
 from typer.testing import CliRunner
 
 from gam_relocalizer.cli.replay import replay
-from gam_relocalizer.errors import BagError, MapError, UsageError
+from gam_relocalizer.errors import BagError, MapError, UsageError, WeightsError
 from gam_relocalizer.localization.localizer import Localizer
 from gam_relocalizer.replay.writing import FIXES, POSES, SUMMARY
 
@@ -29,7 +29,7 @@ def knowing_localizer(monkeypatch: pytest.MonkeyPatch, wall_map: SceneMap) -> Kn
     """The command gets a localizer that knows where it is, whatever the map."""
     localizer = KnowingLocalizer(wall_map.points, refuse=[20])
     localizer.scene_map = wall_map
-    monkeypatch.setattr(Localizer, 'load', lambda _map_path: localizer)
+    monkeypatch.setattr(Localizer, 'load', lambda _map_path, _options: localizer)
     return localizer
 
 
@@ -54,6 +54,7 @@ def test_writes_all_files_and_succeeds_with_refused_attempts(
     summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
     assert (summary['attempts'], summary['accepted'], summary['images']) == (10, 9, 100)
     assert summary['image_topic'] == '/camera/image'
+    assert (summary['matcher'], summary['weights']) == ('gam', None)
     assert 'TOO_FEW_INLIERS' in result.output
 
 
@@ -73,6 +74,35 @@ def test_drive_through_a_rendered_room_is_found_twice_alike(
     for file in (POSES, FIXES):
         first = (tmp_path / 'first' / file).read_bytes()
         assert first == (tmp_path / 'second' / file).read_bytes()
+
+
+def test_matcher_is_the_one_named(tiny_place: TinyPlace, tmp_path: Path) -> None:
+    result = run(
+        tiny_place.bag, '--map', tiny_place.map_path, '--out', tmp_path / 'out',
+        '--period', 2.0, '--truth-topic', '/ground_truth', '--matcher', 'nn-cross',
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    summary = json.loads((tmp_path / 'out' / SUMMARY).read_text(encoding='utf-8'))
+    assert summary['matcher'] == 'nn-cross'
+    assert summary['accepted'] == summary['attempts'] > 0
+    assert summary['position_error']['median'] < 0.05
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'error'),
+    [
+        (['--matcher', 'best'], UsageError),
+        (['--matcher', 'nn-cross', '--weights', 'tuned.npz'], UsageError),
+        (['--weights', 'nowhere.npz'], WeightsError),
+    ],
+)
+def test_matcher_that_cannot_be_had_is_a_failure_that_leaves_nothing(
+    tiny_place: TinyPlace, tmp_path: Path, arguments: list[str], error: type[Exception]
+) -> None:
+    out = tmp_path / 'out'
+    result = run(tiny_place.bag, '--map', tiny_place.map_path, '--out', out, *arguments)
+    assert isinstance(result.exception, error)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.usefixtures('knowing_localizer')

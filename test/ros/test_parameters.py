@@ -53,6 +53,19 @@ def test_thresholds_and_covariance_reach_the_core() -> None:
     assert parameters.covariance_options().mode is CovarianceMode.DIAGONAL
 
 
+def test_the_matcher_and_its_weights_reach_the_core() -> None:
+    options = NodeParameters(matcher='bmnet', weights='~/tuned/bmnet.npz').localizer_options()
+    assert options.matcher == 'bmnet'
+    assert options.weights == Path.home() / 'tuned' / 'bmnet.npz'
+    assert NodeParameters(weights='').localizer_options().weights is None
+
+
+@pytest.mark.parametrize('name', ['map', 'weights'])
+def test_an_unknown_home_folder_is_refused(name: str) -> None:
+    with pytest.raises(UsageError, match=name):
+        NodeParameters(**{name: '~nobody-of-this-name/file'}).path(name)
+
+
 def test_the_file_of_parameters_agrees_with_the_declarations() -> None:
     file = REPOSITORY / 'config' / 'params.yaml'
     content = yaml.safe_load(file.read_text(encoding='utf-8'))
@@ -65,6 +78,9 @@ def test_the_file_of_parameters_agrees_with_the_declarations() -> None:
 def test_the_documentation_lists_every_parameter() -> None:
     page = (REPOSITORY / 'docs' / 'ros_interface.md').read_text(encoding='utf-8')
     assert [name for name in SPECIFICATIONS if f'| `{name}` |' not in page] == []
+    for name, specification in SPECIFICATIONS.items():
+        row = next(line for line in page.splitlines() if line.startswith(f'| `{name}` |'))
+        assert ', '.join(specification.choices) in row
 
 
 @pytest.mark.parametrize('name', NUMBERS)
@@ -85,7 +101,7 @@ def test_numbers_that_are_not_finite_are_refused(value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    'name', ['image_transport', 'image_reliability', 'covariance_mode', 'map_frame']
+    'name', ['image_transport', 'image_reliability', 'matcher', 'covariance_mode', 'map_frame']
 )
 def test_texts_outside_their_choices_are_refused(name: str) -> None:
     with pytest.raises(UsageError, match=name):
@@ -130,6 +146,7 @@ def test_values_are_checked_when_set(node: RelocalizerNode) -> None:
         ('period', 1, 'DOUBLE'),
         ('min_inliers', 3, 'min_inliers'),
         ('covariance_mode', 'half', 'full, diagonal'),
+        ('matcher', 'best', 'nn-cross'),
         ('base_from_camera', '1 2', 'seven'),
         ('autostart', False, 'read-only'),
     ]:
@@ -139,12 +156,21 @@ def test_values_are_checked_when_set(node: RelocalizerNode) -> None:
     assert node.get_parameter('period').value == 0.5
 
 
-def test_the_map_may_be_named_while_the_node_is_unconfigured(node: RelocalizerNode) -> None:
-    assert result_of(node, 'map', '/some/map') == (True, '')
+@pytest.mark.parametrize(
+    ('name', 'value'), [('map', '/some/map'), ('matcher', 'nn-cross'), ('weights', '/some/file')]
+)
+def test_what_is_loaded_may_be_named_while_the_node_is_unconfigured(
+    node: RelocalizerNode, name: str, value: str
+) -> None:
+    assert result_of(node, name, value) == (True, '')
 
 
 @pytest.mark.usefixtures('ros')
 def test_bad_values_at_the_start_are_usage_errors() -> None:
-    for name, value, word in [('period', 1, 'decimal point'), ('max_scenes', 0, 'max_scenes')]:
+    for name, value, word in [
+        ('period', 1, 'decimal point'),
+        ('max_scenes', 0, 'max_scenes'),
+        ('matcher', 'best', 'nn-cross'),
+    ]:
         with pytest.raises(UsageError, match=word):
             RelocalizerNode([Parameter(name, value=value)])

@@ -40,6 +40,23 @@ def test_a_damaged_map_leaves_the_node_alive_until_it_gets_another(
     assert node.stop() == 0
 
 
+def test_weights_that_are_missing_leave_the_node_alive_until_it_can_do_without(
+    start_node: Callable[..., NodeProcess], robot: Robot, tiny_place: TinyPlace, tmp_path: Path
+) -> None:
+    missing = tmp_path / 'nowhere.npz'
+    node = start_node('--map', str(tiny_place.map_path), weights=missing)
+    assert str(missing) in node.wait_for_log('not configured')
+    assert robot.state() == 'unconfigured'
+    assert robot.set_parameter('weights', '') == (True, '')
+    assert robot.set_parameter('matcher', 'nn-cross') == (True, '')
+    assert robot.change_state(Transition.TRANSITION_CONFIGURE)
+    assert 'nn-cross' in node.wait_for_log('networks on the CPU')
+    successful, reason = robot.set_parameter('matcher', 'gam')
+    assert not successful
+    assert 'matcher' in reason
+    assert node.stop() == 0
+
+
 def test_without_a_map_the_node_says_what_it_needs(
     start_node: Callable[..., NodeProcess], robot: Robot
 ) -> None:
