@@ -269,7 +269,8 @@ def true_candidates(query: Query) -> Matches:
     """What a matcher that knows the tracks would keep of the kNN ratio candidates."""
     edges = knn_ratio(query.descriptors, query.point_descriptors, NEIGHBOURS, RATIO).edges
     true = edges[query.true_rows[edges[:, 0]] == edges[:, 1]]
-    return Matches(true[:, 0], true[:, 1], np.ones(len(true), np.float32))
+    weights, nearest = np.ones(len(true), np.float32), np.ones(len(true), np.bool_)
+    return Matches(true[:, 0], true[:, 1], weights, nearest)
 
 
 def score_matches(query: Query, matches: Matches) -> ImageScore:
@@ -287,7 +288,7 @@ def score_matches(query: Query, matches: Matches) -> ImageScore:
     has_truth = query.true_rows[matches.keypoint_indices] != NO_POINT
     found = np.unique(matches.keypoint_indices[is_true])
     near = np.unique(matches.keypoint_indices[has_truth & (is_true | is_near)])
-    pose = estimate_pose(keypoints, points, matches.weights, query.camera)
+    pose = estimate_pose(keypoints, points, matches.weights, query.camera, nearest=matches.nearest)
     error = NO_POSE if pose is None else pose_error(pose.camera_from_map, query.camera_from_map)
     return ImageScore(
         matches=len(matches),

@@ -228,10 +228,8 @@ class Localizer:
         if result.matches < needed:
             reason = f'{result.matches} matches with the scene around `{name}`, needs {needed}'
             return replace(result, reason=reason)
-        keypoints = features.keypoints[matches.keypoint_indices]
-        points = scene.points[matches.point_indices]
         with clock.stage('pose'):
-            estimate = self._estimate(keypoints, points, matches.weights, camera)
+            estimate = self._estimate(matches, features.keypoints, scene.points, camera)
         if estimate is None:
             reason = f'the {result.matches} matches with the scene around `{name}` fit no pose'
             return replace(result, status=Status.NO_POSE, reason=reason)
@@ -259,14 +257,21 @@ class Localizer:
 
     def _estimate(
         self,
-        keypoints: NDArray[np.float32],
-        points: NDArray[np.int64],
-        weights: NDArray[np.float32],
+        matches: Matches,
+        keypoints_in_image: NDArray[np.float32],
+        points_in_scene: NDArray[np.int64],
         camera: pycolmap.Camera,
     ) -> PoseEstimate | None:
-        """The pose of one-to-one matches; `points` are indices into the map."""
+        """The pose of matches between keypoints and points, the latter as indices into the map."""
+        keypoints = keypoints_in_image[matches.keypoint_indices]
+        points = points_in_scene[matches.point_indices]
         pose = estimate_pose(
-            keypoints, self._scene_map.points[points], weights, camera, self._options.pose
+            keypoints,
+            self._scene_map.points[points],
+            matches.weights,
+            camera,
+            self._options.pose,
+            matches.nearest,
         )
         if pose is None:
             return None

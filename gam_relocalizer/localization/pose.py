@@ -30,6 +30,8 @@ RAYLEIGH_MEDIAN = 1.1774
 BEST_SHARE = 0.1
 RAYLEIGH_BEST_SHARE = 0.459
 INLIER_SIGMAS = 3.0
+# Where most inliers are not what their keypoint looks most like, looks have no say.
+NEAREST_SHARE = 0.5
 # Inliers may be tightened down to this share of the threshold of the search.
 TIGHTEST = 1.0 / 3.0
 # Keypoints are found on a grid of pixels and points were triangulated from such keypoints: however
@@ -86,10 +88,13 @@ def estimate_pose(
     weights: NDArray[np.floating],
     camera: pycolmap.Camera,
     options: PoseOptions | None = None,
+    nearest: NDArray[np.bool_] | None = None,
 ) -> AbsolutePose | None:
-    """Prior-guided PnP in a RANSAC loop, then robust refinement on all inliers.
+    """Prior-guided PnP in a RANSAC loop, then robust refinement on the inliers.
 
     Matches of greater weight are sampled first (PROSAC; section 'Prior-Guided Pose Estimation').
+    The refinement leaves out what only geometry speaks for, where enough is left: such a match is
+    in the right place, but often with a neighbour of the very point.
 
     Args:
         keypoints: [K,2] pixels, COLMAP convention.
@@ -97,6 +102,7 @@ def estimate_pose(
         weights: [K] the matcher's confidence.
         camera: Any model of COLMAP.
         options: How to search.
+        nearest: [K] `Matches.nearest`; all of them if not given.
 
     Returns:
         The pose, or nothing where the matches do not determine one.
@@ -110,6 +116,7 @@ def estimate_pose(
         points=local.from_map(points),
         camera=camera,
         threshold=options.max_error * max(camera.width, camera.height) / REFERENCE_SIDE,
+        nearest=np.ones(len(keypoints), np.bool_) if nearest is None else nearest,
     )
     camera_from_local = _search(matches, weights, options)
     if camera_from_local is None:
@@ -205,6 +212,15 @@ class _Matches:
     points: NDArray[np.float64]
     camera: pycolmap.Camera
     threshold: float
+    nearest: NDArray[np.bool_]
+
+    def exact(self, inliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """The inliers [K] to refine with: the nearest ones, unless they are the minority."""
+        nearest = inliers & self.nearest
+        is_enough = np.count_nonzero(nearest) >= max(
+            MIN_MATCHES, NEAREST_SHARE * np.count_nonzero(inliers)
+        )
+        return nearest if is_enough else inliers
 
     def errors(self, camera_from_local: pycolmap.Rigid3d) -> NDArray[np.float64]:
         """Reprojection errors [K] in px."""
@@ -284,14 +300,15 @@ def _without_distortion(
 
 
 def _refine(camera_from_local: pycolmap.Rigid3d, matches: _Matches) -> _Refined | None:
-    """Robust refinement, choosing inliers anew each time."""
+    """Robust refinement on the exact inliers, choosing them anew each time."""
     threshold = matches.threshold
     for _ in range(REFINEMENTS):
         errors = matches.errors(camera_from_local)
         inliers = errors <= threshold
         if np.count_nonzero(inliers) < MIN_MATCHES:
             return None
-        refined = _minimise(camera_from_local, matches, inliers, _cauchy_scale(errors[inliers]))
+        exact = matches.exact(inliers)
+        refined = _minimise(camera_from_local, matches, exact, _cauchy_scale(errors[exact]))
         if refined is None:
             return None
         camera_from_local, _ = refined
@@ -300,10 +317,11 @@ def _refine(camera_from_local: pycolmap.Rigid3d, matches: _Matches) -> _Refined 
     inliers = errors <= threshold
     if np.count_nonzero(inliers) < MIN_MATCHES:
         return None
-    unit_noise = _minimise(camera_from_local, matches, inliers, NO_LOSS_PX, iterations=0)
+    exact = matches.exact(inliers)
+    unit_noise = _minimise(camera_from_local, matches, exact, NO_LOSS_PX, iterations=0)
     if unit_noise is None:
         return None
-    variance = _variance_of_cauchy_estimate(errors[inliers])
+    variance = _variance_of_cauchy_estimate(errors[exact])
     covariance = variance * (FULL_ANGLE @ unit_noise[1] @ FULL_ANGLE)
     return _Refined(camera_from_local, covariance, inliers, errors)
 

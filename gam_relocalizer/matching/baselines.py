@@ -98,4 +98,4 @@ def _closest_of_point(
 
 def _matches(edges: NDArray[np.int64], weights: NDArray[np.floating]) -> Matches:
     in_range = np.clip(weights, 0.0, 1.0).astype(np.float32)
-    return Matches(edges[:, 0], edges[:, 1], in_range)
+    return Matches(edges[:, 0], edges[:, 1], in_range, np.ones(len(edges), np.bool_))

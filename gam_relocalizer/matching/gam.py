@@ -36,6 +36,7 @@ class Gam:
         *,
         pooling: bool = True,
         least_weight: float = 0.0,
+        likeness: float = 0.0,
     ) -> None:
         """Match with a network.
 
@@ -45,12 +46,16 @@ class Gam:
             ratio: See `knn_ratio`.
             pooling: Whether matches are made one-to-one; without it all candidates are matches.
             least_weight: Matches of lower weight are left out.
+            likeness: The pooling maximises the weight times this power of the cosine of the
+                descriptors. Points in one place are all alike to geometry; among them, looks
+                decide. With 0, as in the paper, chance does.
         """
         self._network = network.eval()
         self._neighbours = neighbours
         self._ratio = ratio
         self._pooling = pooling
         self._least_weight = least_weight
+        self._likeness = likeness
 
     def match(self, given: MatchInput) -> Matches:
         """See `Matcher.match`; the weights are the network's probabilities."""
@@ -64,8 +69,11 @@ class Gam:
         weights = self._weigh(edges, distances, given)
         kept = weights >= self._least_weight
         if self._pooling:
-            kept &= hungarian_pooling(edges, weights)
-        return Matches(edges[kept, 0], edges[kept, 1], weights[kept])
+            cosines = np.clip(1.0 - distances**2 / 2.0, 0.0, 1.0)
+            kept &= hungarian_pooling(edges, weights * cosines**self._likeness)
+        # candidates are sorted by keypoint, then by distance
+        nearest = np.diff(edges[:, 0], prepend=-1) > 0
+        return Matches(edges[kept, 0], edges[kept, 1], weights[kept], nearest[kept])
 
     def _weigh(
         self, edges: NDArray[np.int64], distances: NDArray[np.float32], given: MatchInput

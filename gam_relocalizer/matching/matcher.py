@@ -69,11 +69,14 @@ class Matches:
         keypoint_indices: [K] int64.
         point_indices: [K] int64.
         weights: [K] float32 in [0, 1], the matcher's belief that a match is true.
+        nearest: [K] bool, whether the keypoint looks like no other point as much as like this one.
+            Where several points are in the right place, such a match tells best where exactly.
     """
 
     keypoint_indices: NDArray[np.int64]
     point_indices: NDArray[np.int64]
     weights: NDArray[np.float32]
+    nearest: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -81,7 +84,8 @@ class Matches:
     @staticmethod
     def none() -> Matches:
         """No matches."""
-        return Matches(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))
+        nothing = np.empty(0, np.int64)
+        return Matches(nothing, nothing, np.empty(0, np.float32), np.empty(0, np.bool_))
 
 
 class Matcher(Protocol):

@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from gam_relocalizer.matching.networks import NetworkConfig
 
 DEFAULT_MATCHER = 'gam'
+# Below it hardly a match is true, and the search for a pose only has more to draw from.
+_UNLIKELY = 0.1
+# From 4 to 40 it hardly matters; at 0 one match in eighty goes to a double of the point.
+_LIKENESS = 10.0
 # An outlier filter without pooling decides by itself what a match is.
 _LIKELY = 0.5
 # The ablation is about how a network is trained: at half the size, each takes minutes.
@@ -46,6 +50,7 @@ class LearnedMatcher:
         ratio: See `knn_ratio`.
         pooling: Whether Hungarian pooling makes matches one-to-one.
         least_weight: Matches of lower weight are left out.
+        likeness: How much looks count beside the weight in the pooling, see `Gam`.
         mining: Whether kNN ratio matching found the false edges that it learned from.
     """
 
@@ -55,6 +60,7 @@ class LearnedMatcher:
     ratio: float = RATIO
     pooling: bool = True
     least_weight: float = 0.0
+    likeness: float = 0.0
     mining: bool = True
 
     @property
@@ -89,6 +95,7 @@ class LearnedMatcher:
             self.ratio,
             pooling=self.pooling,
             least_weight=self.least_weight,
+            likeness=self.likeness,
         )
 
 
@@ -98,7 +105,7 @@ def _outlier_filter(name: str, network: NetworkConfig) -> LearnedMatcher:
 
 
 LEARNED_MATCHERS = {
-    'gam': LearnedMatcher('gam', GamNetConfig()),
+    'gam': LearnedMatcher('gam', GamNetConfig(), least_weight=_UNLIKELY, likeness=_LIKENESS),
     'bmnet': LearnedMatcher('bmnet', BMNetConfig()),
     'knn-bmnet': LearnedMatcher('bmnet', BMNetConfig(), ratio=0.0),
     'bmnet-small': LearnedMatcher('bmnet-small', _SMALL),

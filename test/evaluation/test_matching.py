@@ -36,7 +36,7 @@ from gam_relocalizer.mapping.leave_one_out import (
     leave_out,
 )
 from gam_relocalizer.matching.baselines import NearestNeighbourCross
-from gam_relocalizer.matching.matcher import Matches
+from gam_relocalizer.matching.matcher import Matches, MatchInput
 from gam_relocalizer.scene_map import ExtractorIdentity, Manifest, MapFrame, SceneMap
 
 CAMERA = pycolmap.Camera(
@@ -68,7 +68,8 @@ def query(scale: float = 1.0, seed: int = 0) -> Query:
 def matches_of(pairs: list[tuple[int, int]], weights: list[float] | None = None) -> Matches:
     keypoints, points = np.array(pairs, np.int64).reshape(-1, 2).T
     given_weights = np.ones(len(pairs)) if weights is None else np.array(weights)
-    return Matches(keypoints, points, given_weights.astype(np.float32))
+    nearest = np.ones(len(keypoints), np.bool_)
+    return Matches(keypoints, points, given_weights.astype(np.float32), nearest)
 
 
 def all_true(count: int = NUM_POINTS) -> list[tuple[int, int]]:
@@ -296,15 +297,9 @@ class FindsNothing:
         self.keypoints: list[np.ndarray] = []
         self.points: list[np.ndarray] = []
 
-    def match(
-        self,
-        keypoints_normalised: np.ndarray,
-        descriptors: np.ndarray,  # noqa: ARG002
-        points: np.ndarray,
-        point_descriptors: np.ndarray,  # noqa: ARG002
-    ) -> Matches:
-        self.keypoints.append(keypoints_normalised)
-        self.points.append(points)
+    def match(self, given: MatchInput) -> Matches:
+        self.keypoints.append(given.keypoints)
+        self.points.append(given.points)
         return Matches.none()
 
 

@@ -109,13 +109,16 @@ def test_mean_over_maps_comes_first_and_has_no_unit_of_a_map() -> None:
 
 
 def test_matchers_stand_in_the_tables_of_the_paper() -> None:
-    scores = {name: score(0.5, 0.1) for name in ('knn-bmnet', 'bmnet', 'plainnet', 'nn-ratio')}
+    scores = {
+        name: score(0.5, 0.1)
+        for name in ('knn-bmnet', 'bmnet', 'plainnet', 'bmnet-small', 'nn-ratio')
+    }
     text = markdown(report_of(evaluation('metric', scores)))
     sections = {part.split('\n')[0]: part for part in text.split('## ')[1:]}
     names = {title: [row[0] for row in rows_of(part)[1:-1]] for title, part in sections.items()}
     assert names == {
         '2D-3D matching': ['nn-ratio', 'bmnet'],
-        'Ablation study': ['plainnet', 'bmnet'],
+        'Ablation study': ['plainnet', 'bmnet-small'],
         'Other matchers': ['knn-bmnet'],
     }
 

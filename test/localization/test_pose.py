@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -93,6 +93,41 @@ def test_covariance_tells_the_true_spread(camera: pycolmap.Camera) -> None:
     ]
     low, high = chi2.ppf([0.025, 0.975], 6 * trials) / trials
     assert low <= np.mean(errors) <= high
+
+
+def with_neighbours_of_the_point(trial: Trial, share: float) -> tuple[Trial, np.ndarray]:
+    """Some of the true matches shifted to one side by a few pixels, and which are not."""
+    count = len(trial.keypoints)
+    nearest = np.arange(count) >= share * count
+    shift = np.where(nearest[:, None], 0.0, [6.0, 3.0])
+    return replace(trial, keypoints=trial.keypoints + shift), nearest
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_refines_with_what_looks_and_geometry_agree_on(seed: int) -> None:
+    trial, nearest = with_neighbours_of_the_point(
+        make_trial(PINHOLE, seed, outliers=0, noise=0.3), share=0.4
+    )
+
+    blind = estimate(trial, PINHOLE)
+    told = estimate_pose(trial.keypoints, trial.points, trial.weights, PINHOLE, nearest=nearest)
+
+    assert told is not None
+    error = pose_error(told.camera_from_map, trial.camera_from_map)
+    assert error.rotation_deg < 0.05
+    assert (
+        error.rotation_deg < pose_error(blind.camera_from_map, trial.camera_from_map).rotation_deg
+    )
+
+
+def test_looks_have_no_say_where_they_are_the_minority() -> None:
+    trial, nearest = with_neighbours_of_the_point(make_trial(PINHOLE, 0, outliers=0), share=0.8)
+
+    blind = estimate(trial, PINHOLE)
+    told = estimate_pose(trial.keypoints, trial.points, trial.weights, PINHOLE, nearest=nearest)
+
+    assert told is not None
+    np.testing.assert_array_equal(told.camera_from_map.matrix(), blind.camera_from_map.matrix())
 
 
 @pytest.mark.parametrize('model', MODELS)

@@ -120,6 +120,17 @@ def test_matches_below_the_least_weight_are_left_out(views: list[SyntheticView])
     np.testing.assert_array_equal(likely.point_indices, every.point_indices[expected])
 
 
+def test_nearest_is_what_a_keypoint_looks_most_like(views: list[SyntheticView]) -> None:
+    network, _ = load_weights(LEARNED_MATCHERS['gam'].shipped)
+    view = views[0]
+    candidates = knn_ratio(view.descriptors, view.point_descriptors)
+    _, first = np.unique(candidates.edges[:, 0], return_index=True)
+
+    matches = _match(Gam(network, pooling=False), view)
+
+    np.testing.assert_array_equal(np.flatnonzero(matches.nearest), first)
+
+
 def test_without_pooling_every_likely_candidate_is_a_match(views: list[SyntheticView]) -> None:
     network, _ = load_weights(LEARNED_MATCHERS['gam'].shipped)
     view = views[0]
