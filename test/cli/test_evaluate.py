@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from gam_relocalizer.cli.main import app
 from gam_relocalizer.errors import ImageError, MapError, UsageError
+from gam_relocalizer.evaluation.matching import TRUE_CANDIDATES
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 from gam_relocalizer.scene_map import SFM, MapContent, load_map, save_map
 
@@ -60,7 +61,7 @@ def test_prints_a_table_and_writes_the_same(corner: Corner, tmp_path: Path) -> N
     assert '| nn-ratio |' in done.stdout
     content = json.loads((tmp_path / 'a' / 'b' / 'matching.json').read_text())
     (only,) = content['maps']
-    assert list(only['matchers']) == ['nn-ratio', 'nn-cross']
+    assert list(only['matchers']) == ['nn-ratio', 'nn-cross', TRUE_CANDIDATES]
     for score in only['matchers'].values():
         assert score['precision'] > 0.5
         assert score['recall'] > 0.5
