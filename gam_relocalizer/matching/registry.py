@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 DEFAULT_MATCHER = 'gam'
 # Below it hardly a match is true, and the search for a pose only has more to draw from.
 _UNLIKELY = 0.1
-# From 4 to 40 it hardly matters; at 0 one match in eighty goes to a double of the point.
+# Anything from 4 to 40 does as well.
 _LIKENESS = 10.0
 # An outlier filter without pooling decides by itself what a match is.
 _LIKELY = 0.5
