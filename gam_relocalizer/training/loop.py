@@ -19,6 +19,7 @@ import math
 import pickle
 import signal
 import time
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -246,6 +247,10 @@ class Trainer:
             TrainingError: The directory holds another run, or the loss is no longer finite.
             KeyboardInterrupt: After `stop`, with a checkpoint of the last step.
         """
+        with _one_thread():
+            return self._run(observer, checkpoint_seconds)
+
+    def _run(self, observer: Observer, checkpoint_seconds: float) -> MatchMetrics:
         self._claim_directory()
         validation = self._source.validation(self.options.validation_graphs)
         metrics, loss = None, None
@@ -420,6 +425,20 @@ def _differences(found: object, expected: dict[str, Any]) -> str:
         for name in names
         if found.get(name) != expected.get(name)
     )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Layers of small graphs gain nothing from a second thread, and lose where cores are busy.
+
+    The other cores draw the graphs. What a run computes then does not depend on their number.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _as_it_is(batch: GraphBatch) -> GraphBatch:

@@ -128,6 +128,20 @@ def test_a_run_leaves_checkpoint_log_curves_and_weights(
     assert provenance.average_precision == read_log(directory)[-1]['average_precision']
 
 
+def test_the_number_of_threads_does_not_matter_and_stays(
+    finished: tuple[Path, dict[int, float]], tmp_path: Path
+) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    recorder = Recorder()
+
+    Trainer(OPTIONS, tmp_path / 'two').run(recorder)
+
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(threads)
+    assert recorder.losses == finished[1]
+
+
 def test_same_seed_same_weights(finished: tuple[Path, dict[int, float]], tmp_path: Path) -> None:
     recorder = Recorder()
 
