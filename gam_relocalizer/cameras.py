@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pycolmap
 
 from gam_relocalizer.errors import CameraError
@@ -16,7 +17,19 @@ from gam_relocalizer.errors import CameraError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
 MAX_IMAGE_SIDE = 16384
+
+# Those of COLMAP that have a focal length; a panorama sees all around and has none.
+CAMERA_MODELS = tuple(
+    sorted(pycolmap.CameraModelId.__members__.keys() - {'INVALID', 'EQUIRECTANGULAR'})
+)
+
+# Beyond so many pixels from where a keypoint was, its ray is not the inverse of its projection.
+ROUND_TRIP_PX = 0.5
+# Rays further off the axis run away on the image plane, which ends at 90 degrees.
+MAX_TANGENT = math.tan(math.radians(80.0))
 
 # OpenCV and ROS put pixel centres at integers, COLMAP at half-integers.
 PIXEL_CENTRE = 0.5
@@ -54,7 +67,7 @@ def parse_camera(description: str | Path) -> pycolmap.Camera:
         description: A path to a file, or the line itself (COLMAP's cameras.txt without the id).
 
     Raises:
-        CameraError: The file is missing or the line is not a camera of a known model.
+        CameraError: The file is missing or the line is not a camera of one of `CAMERA_MODELS`.
     """
     text, source = _description_text(description)
     words = text.split('#', maxsplit=1)[0].split()
@@ -117,6 +130,33 @@ def camera_from_calibration(
     return _checked_camera(model, width, height, params, 'CameraInfo')
 
 
+def undistort(keypoints: NDArray[np.floating], camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Where the rays of keypoints cut the plane at unit depth.
+
+    Args:
+        keypoints: [K,2] pixels, COLMAP convention.
+        camera: One of `CAMERA_MODELS`.
+
+    Returns:
+        [K,2]; NaN for rays more than 80 degrees off the axis and for keypoints that no ray projects
+        to. COLMAP itself answers with a wrong ray for many of them, as in a fisheye's corners.
+    """
+    pixels = np.asarray(keypoints, np.float64).reshape(-1, 2)
+    if not len(pixels):
+        return pixels
+    on_plane = np.asarray(camera.cam_from_img(pixels), np.float64)
+    projected = np.asarray(camera.img_from_cam(np.column_stack([on_plane, np.ones(len(pixels))])))
+    offset = np.linalg.norm(projected - pixels, axis=1)
+    tangent = np.linalg.norm(on_plane, axis=1)
+    known = (offset < ROUND_TRIP_PX) & (tangent < MAX_TANGENT)
+    return np.where(known[:, None], on_plane, np.nan)
+
+
+def have_known_rays(keypoints: NDArray[np.floating], camera: pycolmap.Camera) -> NDArray[np.bool_]:
+    """Which keypoints [K,2] `undistort` knows the rays of."""
+    return np.asarray(np.isfinite(undistort(keypoints, camera)).all(axis=1))
+
+
 def _distortion(calibration: CameraCalibration) -> tuple[str, list[float]]:
     """COLMAP model name and distortion parameters of a CameraInfo (OpenCV's order in D)."""
     name, d = calibration.distortion_model, list(calibration.d)
@@ -171,9 +211,11 @@ def _checked_camera(
     model: str, width: int, height: int, params: Sequence[float], source: str
 ) -> pycolmap.Camera:
     """Builds the camera, refusing what COLMAP would abort on."""
-    models = {name for name in pycolmap.CameraModelId.__members__ if name != 'INVALID'}
-    if model not in models:
-        msg = f'{source}: unknown camera model `{model}`; known are {", ".join(sorted(models))}'
+    if model not in CAMERA_MODELS:
+        msg = (
+            f'{source}: camera model `{model}` is unknown or has no focal length; use one of '
+            f'{", ".join(CAMERA_MODELS)}'
+        )
         raise CameraError(msg)
     if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE):
         msg = f'{source}: image size {width} x {height} is not between 1 and {MAX_IMAGE_SIDE}'

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from gam_relocalizer import MAX_IMAGE_PIXELS
 from gam_relocalizer.errors import ImageError, UsageError
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     ImageData: TypeAlias = bytes | bytearray | memoryview | array[int] | NDArray[np.uint8]
 
 IMAGE_SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.ppm'})
-MAX_PIXELS = 200_000_000
 MIN_BAYER_SIDE = 3
 
 
@@ -123,7 +123,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Calibrations and SfM speak of the pixels as stored, so that is what everyone gets.
 
     Raises:
-        ImageError: The file is missing, is no image, or is larger than `MAX_PIXELS`.
+        ImageError: The file is missing, is no image, or is larger than `MAX_IMAGE_PIXELS`.
     """
     try:
         encoded = np.fromfile(path, dtype=np.uint8)
@@ -141,19 +141,24 @@ def decode_compressed(encoded: NDArray[np.uint8], source: str) -> NDArray[np.uin
         source: File or topic, for the error.
 
     Raises:
-        ImageError: Not an image, damaged, or larger than `MAX_PIXELS`.
+        ImageError: Not an image, damaged, or larger than `MAX_IMAGE_PIXELS`.
     """
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(encoded, flags) if encoded.size else None
     except cv2.error as err:
-        msg = f'{source}: cannot be decoded as an image: {err.err}'
+        msg = (
+            f'{source}: cannot be decoded as an image of at most {MAX_IMAGE_PIXELS} pixels: '
+            f'{err.err}'
+        )
         raise ImageError(msg) from err
     if image is None:
         msg = f'{source}: cannot be decoded as an image; it is damaged or of an unknown format'
         raise ImageError(msg)
-    if image.shape[0] * image.shape[1] > MAX_PIXELS:
-        msg = f'{source}: {image.shape[1]} x {image.shape[0]} pixels are more than {MAX_PIXELS}'
+    if image.shape[0] * image.shape[1] > MAX_IMAGE_PIXELS:
+        msg = (
+            f'{source}: {image.shape[1]} x {image.shape[0]} pixels are more than {MAX_IMAGE_PIXELS}'
+        )
         raise ImageError(msg)
     return np.asarray(image, dtype=np.uint8)
 
@@ -210,10 +215,10 @@ def decode_image(
 
 
 def _check_size(layout: _Encoding, encoding: str, width: int, height: int, source: str) -> None:
-    if min(width, height) < layout.min_side or width * height > MAX_PIXELS:
+    if min(width, height) < layout.min_side or width * height > MAX_IMAGE_PIXELS:
         msg = (
             f'{source}: {width} x {height} pixels; {encoding} needs at least {layout.min_side} in '
-            f'width and height, and at most {MAX_PIXELS} in all'
+            f'width and height, and at most {MAX_IMAGE_PIXELS} in all'
         )
         raise ImageError(msg)
     if width % layout.width_multiple:

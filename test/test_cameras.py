@@ -14,16 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gam_relocalizer.cameras import (
+    CAMERA_MODELS,
     CameraCalibration,
     camera_from_calibration,
     format_camera,
     parse_camera,
+    undistort,
 )
 from gam_relocalizer.errors import CameraError
 
-# A panorama has no focal length, so nothing here can work with it.
-UNUSABLE = {'INVALID', 'EQUIRECTANGULAR'}
-MODELS = sorted(pycolmap.CameraModelId.__members__.keys() - UNUSABLE)
 K = (410.0, 0.0, 322.5, 0.0, 405.0, 238.25, 0.0, 0.0, 1.0)
 P = (380.0, 0.0, 318.0, 0.0, 0.0, 382.0, 241.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 RAW = CameraCalibration(640, 480, '', (), K, P)
@@ -129,7 +128,7 @@ def test_refuses_rectified_image_without_projection_matrix() -> None:
         camera_from_calibration(replace(RAW, p=(0.0,) * 12), image_is_rectified=True)
 
 
-@pytest.mark.parametrize('model', MODELS)
+@pytest.mark.parametrize('model', CAMERA_MODELS)
 def test_format_and_parse_are_inverse_for_every_model(model: str) -> None:
     camera = pycolmap.Camera.create_from_model_name(1, model, 433.3, 640, 480)
     parsed = parse_camera(format_camera(camera))
@@ -177,9 +176,37 @@ def test_refuses_text_that_is_no_camera(description: str) -> None:
         parse_camera(description)
 
 
+def test_tells_which_models_there_are_instead_of_a_panorama() -> None:
+    with pytest.raises(CameraError) as caught:
+        parse_camera('EQUIRECTANGULAR 640 480 640 480')
+    assert all(model in str(caught.value) for model in ('EQUIRECTANGULAR', *CAMERA_MODELS))
+
+
 @pytest.mark.parametrize('content', [b'', b'# nothing\n', b'\xff\xfe\x00PINHOLE'])
 def test_refuses_file_without_a_camera(tmp_path, content: bytes) -> None:  # noqa: ANN001
     file = tmp_path / 'camera.txt'
     file.write_bytes(content)
     with pytest.raises(CameraError):
         parse_camera(file)
+
+
+@pytest.mark.parametrize(
+    ('model', 'params'),
+    [
+        ('PINHOLE', [330, 330, 512, 384]),
+        ('OPENCV_FISHEYE', [330, 330, 512, 384, -0.02, 0.01, 0.0, 0.0]),
+        ('FOV', [330, 330, 512, 384, 0.9]),
+        ('EUCM', [330, 330, 512, 384, 0.6, 1.0]),
+        ('SIMPLE_DIVISION', [330, 512, 384, -0.3]),
+    ],
+)
+def test_a_known_ray_projects_to_its_keypoint_even_in_the_corners(
+    model: str, params: list[float]
+) -> None:
+    camera = pycolmap.Camera(camera_id=1, model=model, width=1024, height=768, params=params)
+    keypoints = np.random.default_rng(0).uniform([0, 0], [1024, 768], (2000, 2))
+    rays = undistort(keypoints, camera)
+    known = np.isfinite(rays).all(axis=1)
+    again = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(2000)])[known]))
+    assert np.mean(known) > 0.7
+    assert np.linalg.norm(again - keypoints[known], axis=1).max() < 0.5

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import array
+import struct
+import subprocess
+import sys
+import zlib
 from typing import TYPE_CHECKING
 
 import cv2
@@ -244,6 +248,41 @@ def test_refuses_damaged_compressed_image(size: int) -> None:
     encoded = cv2.imencode('.jpg', random_image((32, 32), 3))[1][:size]
     with pytest.raises(ImageError, match='/camera/image/compressed'):
         decode_compressed(encoded, '/camera/image/compressed')
+
+
+def png_of_one_grey(width: int, height: int) -> bytes:
+    packed = zlib.compressobj(9)
+    rows = b''.join(packed.compress(bytes(width + 1)) for _ in range(height)) + packed.flush()
+    size = struct.pack('>IIBBBBB', width, height, 8, 0, 0, 0, 0)
+    chunks = [(b'IHDR', size), (b'IDAT', rows), (b'IEND', b'')]
+    return b'\x89PNG\r\n\x1a\n' + b''.join(
+        struct.pack('>I', len(data)) + kind + data + struct.pack('>I', zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+
+
+REFUSE_IN_LITTLE_MEMORY = """
+import resource, sys
+from pathlib import Path
+from gam_relocalizer.errors import ImageError
+from gam_relocalizer.images import read_image
+
+used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    read_image(Path(sys.argv[1]))
+except ImageError:
+    more_kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - used
+    sys.exit(more_kilobytes > 100_000)
+sys.exit(2)
+"""
+
+
+def test_refuses_a_small_file_of_a_huge_image_before_taking_memory_for_it(tmp_path: Path) -> None:
+    bomb = tmp_path / 'bomb.png'
+    bomb.write_bytes(png_of_one_grey(15_000, 15_000))
+    assert bomb.stat().st_size < 1_000_000
+    command = [sys.executable, '-c', REFUSE_IN_LITTLE_MEMORY, str(bomb)]
+    assert subprocess.run(command, check=False).returncode == 0
 
 
 def test_missing_file_is_named(tmp_path: Path) -> None:

@@ -33,6 +33,10 @@ class ImageCameras:
     cameras: tuple[pycolmap.Camera, ...]
     of_image: tuple[int, ...]
 
+    def of(self, image: int) -> pycolmap.Camera:
+        """The camera that took an image."""
+        return self.cameras[self.of_image[image]]
+
 
 def assign_cameras(
     folder: Path, images: Sequence[MappingImage], camera: pycolmap.Camera | None

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pycolmap
 
+from gam_relocalizer.cameras import have_known_rays
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
@@ -67,16 +69,25 @@ def quiet_colmap() -> Iterator[None]:
 
 
 def write_database(path: Path, sfm_input: SfmInput) -> None:
-    """Writes cameras, images, keypoints and raw matches to a new COLMAP database."""
+    """Writes cameras, images, keypoints and raw matches to a new COLMAP database.
+
+    Keypoints whose ray the camera model does not know keep their place and have no match: COLMAP
+    would give them a wrong ray.
+    """
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         for camera in sfm_input.cameras.cameras:
             database.write_camera(camera, use_camera_id=True)
             database.write_rig(_trivial_rig(camera), use_rig_id=True)
         for index, image in enumerate(sfm_input.images):
             _write_image(database, index, image, sfm_input)
+        known = [
+            have_known_rays(image.features.keypoints, sfm_input.cameras.of(index))
+            for index, image in enumerate(sfm_input.images)
+        ]
         for (first, second), matches in sfm_input.matches.items():
+            usable = matches[known[first][matches[:, 0]] & known[second][matches[:, 1]]]
             database.write_matches(
-                image_id_of(first), image_id_of(second), matches.astype(np.uint32)
+                image_id_of(first), image_id_of(second), usable.astype(np.uint32)
             )
 
 
@@ -205,7 +216,7 @@ def _colmap_image(index: int, image: MappingImage, sfm_input: SfmInput) -> pycol
     return pycolmap.Image(
         name=image.name,
         keypoints=image.features.keypoints.astype(np.float64),
-        camera_id=sfm_input.cameras.cameras[sfm_input.cameras.of_image[index]].camera_id,
+        camera_id=sfm_input.cameras.of(index).camera_id,
         image_id=image_id_of(index),
     )
 

@@ -16,6 +16,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from gam_relocalizer.cameras import undistort
 from gam_relocalizer.matching.graph import MatchingNetwork
 
 if TYPE_CHECKING:
@@ -153,13 +154,10 @@ def normalise_keypoints(
         camera: Camera that took the image.
 
     Returns:
-        [M, 2]; not finite where the camera model cannot undistort a keypoint.
+        [M, 2]; NaN where the camera model knows no ray, see `undistort`.
     """
-    if not len(keypoints):
-        return np.empty((0, 2), np.float32)
-    on_plane = camera.cam_from_img(np.asarray(keypoints, np.float64))
     focal_length = np.float32(normalised_focal_length(camera))
-    return np.asarray(on_plane, np.float32).reshape(-1, 2) * focal_length
+    return undistort(keypoints, camera).astype(np.float32) * focal_length
 
 
 def normalised_focal_length(camera: pycolmap.Camera) -> float:

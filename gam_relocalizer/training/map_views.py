@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gam_relocalizer.cameras import have_known_rays
 from gam_relocalizer.mapping.leave_one_out import NO_POINT
 from gam_relocalizer.matching.bmnet import normalise_keypoints, normalised_focal_length
 from gam_relocalizer.training.labelled import meet
@@ -137,7 +138,7 @@ def _some_keypoints(
     query: ReferenceImage, count: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Some of the keypoints, of the whole image or of a square in it."""
-    chosen = rng.permutation(len(query.keypoints))
+    chosen = rng.permutation(np.flatnonzero(have_known_rays(query.keypoints, query.camera)))
     if rng.random() < 0.4:
         size = np.array([query.camera.width, query.camera.height])
         centre, side = rng.uniform(0, 1, 2) * size, rng.uniform(0.4, 0.9) * size.max()

@@ -115,6 +115,18 @@ def test_keypoints_are_undistorted() -> None:
     )
 
 
+def test_keypoints_without_a_known_ray_are_not_a_number() -> None:
+    camera = pycolmap.Camera(
+        model='OPENCV_FISHEYE', width=640, height=480, params=[200, 200, 320, 240, 0, 0, 0, 0]
+    )
+    # 1.75 focal lengths from the centre an equidistant lens looks backwards
+    pixels = np.array([[320.0, 240.0], [320.0 + 350.0, 240.0]])
+
+    np.testing.assert_array_equal(
+        np.isfinite(normalise_keypoints(pixels, camera)).all(axis=1), [True, False]
+    )
+
+
 def test_no_keypoints_and_no_points() -> None:
     camera = pycolmap.Camera(
         model='PINHOLE', width=640, height=480, params=[500.0, 500.0, 320.0, 240.0]

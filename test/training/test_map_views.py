@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import poselib
+import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gam_relocalizer.cameras import have_known_rays
 from gam_relocalizer.mapping.leave_one_out import NO_POINT
 from gam_relocalizer.matching.bmnet import normalise_keypoints
 from gam_relocalizer.training.labelled import TRUE_ERROR
@@ -50,6 +52,28 @@ def reference_of(references: ReferenceImages, view: MapView) -> tuple[int, np.nd
         if apart.min(axis=0).max() < 1e-4:
             return image, np.asarray(apart.argmin(axis=0))
     raise AssertionError
+
+
+def test_keypoints_without_a_known_ray_teach_nothing(references: ReferenceImages) -> None:
+    camera = references.images[0].camera
+    focal = camera.width / 4
+    fisheye = pycolmap.Camera(
+        camera_id=1,
+        model='SIMPLE_FISHEYE',
+        width=camera.width,
+        height=camera.height,
+        params=[focal, camera.width / 2, camera.height / 2],
+    )
+    by_fisheye = replace(
+        references, images=tuple(replace(image, camera=fisheye) for image in references.images)
+    )
+    known = have_known_rays(references.images[0].keypoints, fisheye)
+    sizes = set()
+    for seed in range(20):
+        view = drawn(by_fisheye, 0, seed)
+        assert np.isfinite(view.keypoints).all()
+        sizes.add(len(view.keypoints))
+    assert max(sizes) == np.count_nonzero(known) < len(known)
 
 
 @draws
