@@ -16,6 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from gam_relocalizer.cli.options import GlobalWeightsOption
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -61,6 +63,13 @@ def build(  # noqa: PLR0913 - one argument per option
     mapper: Annotated[Mapper, typer.Option(help='Used without poses.')] = Mapper.INCREMENTAL,
     max_keypoints: Annotated[int, typer.Option(min=1, help='Features per image.')] = 2048,
     *,
+    global_descriptor: Annotated[
+        str,
+        typer.Option(
+            '--global', help='What images are retrieved by: vlad, or netvlad with its weights.'
+        ),
+    ] = 'vlad',
+    global_weights: GlobalWeightsOption = None,
     refine_camera: Annotated[
         bool, typer.Option('--refine-camera', help='Refine the given camera as well.')
     ] = False,
@@ -81,6 +90,8 @@ def build(  # noqa: PLR0913 - one argument per option
         extractor=extractor,
         max_keypoints=max_keypoints,
         mapper=mapper.value,
+        global_descriptor=global_descriptor,
+        global_weights=global_weights,
     )
     with _progress_bars() as progress:
         report = build_map(images, out, options, progress)
@@ -168,10 +179,12 @@ def _print_manifest(manifest: Manifest, path: Path) -> None:
     frame = manifest.frame
     options = manifest.build.get('options', {})
     report = manifest.build.get('report', {})
+    weights_sha256 = manifest.retrieval_weights_sha256
+    weights = f', weights with sha256 {weights_sha256[:12]}...' if weights_sha256 else ''
     rows = {
         'map id': manifest.map_id,
         'extractor': f'{manifest.extractor.name}, {manifest.extractor.dimension}-D',
-        'retrieval': manifest.retrieval,
+        'retrieval': f'{manifest.retrieval}{weights}',
         **{name: str(count) for name, count in manifest.counts.items()},
         'scale': f'{frame.scale:.6g} ({"metric" if frame.metric else "not metric"})',
         'frame from': frame.source,

@@ -24,3 +24,10 @@ WeightsOption = Annotated[
         help='Weights file of the matcher, as `train` writes it; by default the shipped one.',
     ),
 ]
+GlobalWeightsOption = Annotated[
+    Path | None,
+    typer.Option(
+        '--global-weights',
+        help='Weights file of NetVLAD; a map built with `--global netvlad` needs it.',
+    ),
+]

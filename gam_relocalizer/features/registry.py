@@ -1,20 +1,26 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""The extractors by the name that maps and command lines know them by."""
+"""Local and global descriptors by the name that maps and command lines know them by."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gam_relocalizer.errors import UsageError
+from gam_relocalizer.errors import MapError, UsageError
+from gam_relocalizer.features.vlad import RETRIEVAL_NAME, Vlad
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
+    from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor
+    from gam_relocalizer.scene_map import SceneMap
 
 DEFAULT_EXTRACTOR = 'xfeat'
 DEFAULT_MAX_KEYPOINTS = 2048
+DEFAULT_GLOBAL_DESCRIPTOR = RETRIEVAL_NAME
+GLOBAL_DESCRIPTOR_NAMES = (RETRIEVAL_NAME, 'netvlad')
 
 
 def create_extractor(
@@ -37,6 +43,69 @@ def create_extractor(
         msg = f'max_keypoints must be at least 1, found {max_keypoints}'
         raise UsageError(msg)
     return _FACTORIES[name](max_keypoints)
+
+
+def load_global_descriptor(name: str, weights: Path | None) -> GlobalDescriptor | None:
+    """The global descriptor of that name when it comes with weights of its own.
+
+    Args:
+        name: One of `GLOBAL_DESCRIPTOR_NAMES`.
+        weights: Its weights file.
+
+    Returns:
+        None for VLAD, which is learned from the images of a map and kept in it.
+
+    Raises:
+        UsageError: Unknown name, or weights that are missing or not needed.
+        WeightsError: The weights file is missing or damaged, or not one of this descriptor.
+    """
+    if name not in GLOBAL_DESCRIPTOR_NAMES:
+        known = ', '.join(GLOBAL_DESCRIPTOR_NAMES)
+        msg = f'unknown global descriptor `{name}`; known are {known}'
+        raise UsageError(msg)
+    if name == RETRIEVAL_NAME:
+        if weights is not None:
+            msg = (
+                f'{weights}: given as weights of the global descriptor, but `{name}` has none; '
+                f'leave them out'
+            )
+            raise UsageError(msg)
+        return None
+    if weights is None:
+        msg = f'the global descriptor `{name}` needs a weights file, and none is given'
+        raise UsageError(msg)
+    from gam_relocalizer.features.netvlad import NetVlad
+
+    return NetVlad.load(weights)
+
+
+def global_descriptor_of(scene_map: SceneMap, weights: Path | None = None) -> GlobalDescriptor:
+    """What described the reference images of a map; whether it is the same, the caller checks.
+
+    Args:
+        scene_map: The map.
+        weights: Weights file of its global descriptor, when that has one.
+
+    Raises:
+        MapError: The map has an unknown global descriptor, or one with weights and none are given.
+        UsageError: Weights are given and not needed.
+        WeightsError: The weights file is missing or damaged, or not one of this descriptor.
+    """
+    manifest = scene_map.manifest
+    if manifest.retrieval not in GLOBAL_DESCRIPTOR_NAMES:
+        msg = (
+            f'{scene_map.path}: made with the global descriptor `{manifest.retrieval}`, known are '
+            f'{", ".join(GLOBAL_DESCRIPTOR_NAMES)}; build the map again with one of them'
+        )
+        raise MapError(msg)
+    if manifest.retrieval_weights_sha256 and weights is None:
+        msg = (
+            f'{scene_map.path}: made with the global descriptor `{manifest.retrieval}`, which '
+            f'needs its weights file (sha256 {manifest.retrieval_weights_sha256}): give it with '
+            f'--global-weights, or as the parameter `global_weights` of the node'
+        )
+        raise MapError(msg)
+    return load_global_descriptor(manifest.retrieval, weights) or Vlad(scene_map.codebook)
 
 
 def _xfeat(max_keypoints: int) -> LocalExtractor:

@@ -19,6 +19,8 @@ from gam_relocalizer.errors import MapBuildError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from gam_relocalizer.features.local import LocalFeatures
+
 RETRIEVAL_NAME = 'vlad'
 # Some 400 per word; k-means++ takes seconds on many more.
 _MAX_TRAINING_DESCRIPTORS = 25_000
@@ -34,6 +36,16 @@ class Vlad:
     """
 
     codebook: NDArray[np.float32]
+
+    @property
+    def name(self) -> str:
+        """What maps and command lines know it by."""
+        return RETRIEVAL_NAME
+
+    @property
+    def weights_sha256(self) -> str:
+        """Empty: its words are in the map."""
+        return ''
 
     @property
     def dimension(self) -> int:
@@ -65,8 +77,16 @@ class Vlad:
         )
         return Vlad(centres.astype(np.float32))
 
-    def describe(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Global descriptor of one image.
+    def describe(
+        self,
+        image: NDArray[np.uint8],  # noqa: ARG002 - the contract: others describe by the pixels
+        features: LocalFeatures,
+    ) -> NDArray[np.float32]:
+        """Global descriptor [G] of one image, by its local features; see `aggregate`."""
+        return self.aggregate(features.descriptors)
+
+    def aggregate(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Global descriptor of the image that local descriptors are of.
 
         Args:
             descriptors: [M,D] its local descriptors.

@@ -18,10 +18,12 @@ from gam_relocalizer.cameras import format_camera
 from gam_relocalizer.errors import MapBuildError, MapError, PosesFileError, UsageError
 from gam_relocalizer.features.registry import (
     DEFAULT_EXTRACTOR,
+    DEFAULT_GLOBAL_DESCRIPTOR,
     DEFAULT_MAX_KEYPOINTS,
     create_extractor,
+    load_global_descriptor,
 )
-from gam_relocalizer.features.vlad import RETRIEVAL_NAME, Vlad
+from gam_relocalizer.features.vlad import Vlad
 from gam_relocalizer.images import list_images
 from gam_relocalizer.mapping.descriptors import describe_points
 from gam_relocalizer.mapping.extraction import extract_images
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor
     from gam_relocalizer.mapping.extraction import ExtractedImages, MappingImage
     from gam_relocalizer.mapping.progress import Progress
@@ -73,6 +76,8 @@ class MapBuildOptions:
         extractor: Name of the local features.
         max_keypoints: Features per image.
         mapper: `incremental` or `global` structure from motion; unused with poses.
+        global_descriptor: Name of what images are retrieved by.
+        global_weights: Weights file of the global descriptor, when it needs one.
     """
 
     camera: pycolmap.Camera | None = None
@@ -82,6 +87,8 @@ class MapBuildOptions:
     extractor: str = DEFAULT_EXTRACTOR
     max_keypoints: int = DEFAULT_MAX_KEYPOINTS
     mapper: str = 'incremental'
+    global_descriptor: str = DEFAULT_GLOBAL_DESCRIPTOR
+    global_weights: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -96,10 +103,11 @@ class _Model:
 
 @dataclass(frozen=True)
 class _Retrieval:
-    """Global descriptors of the images, and what made them."""
+    """Global descriptors of the images, and what made them; a codebook if it was learned here."""
 
-    vlad: Vlad
+    describer: GlobalDescriptor
     global_descriptors: NDArray[np.float32]
+    codebook: NDArray[np.float32]
 
 
 def build_map(
@@ -114,7 +122,9 @@ def build_map(
         progress: Told of the steps extract, match, verify, sfm and save.
 
     Raises:
-        UsageError: No images, unknown extractor or mapper, or a camera that does not fit.
+        UsageError: No images, unknown extractor, global descriptor or mapper, weights missing or
+            not needed, or a camera that does not fit.
+        WeightsError: Weights of the local or global descriptor are missing or damaged.
         PosesFileError: The poses name none of the images.
         MapError: `out` exists and is not a map bundle, or cannot be written.
         MapBuildError: The images do not make a map; the message says why and what to do.
@@ -124,16 +134,17 @@ def build_map(
         msg = f'unknown mapper `{options.mapper}`; known are {", ".join(MAPPERS)}'
         raise UsageError(msg)
     extractor = create_extractor(options.extractor, options.max_keypoints)
+    describer = load_global_descriptor(options.global_descriptor, options.global_weights)
     given = list_images(images)
     _check_names(given)
     wanted = _with_pose(given, options.poses)
     timer = StepTimer()
     with timer.step('extract'):
-        extracted = extract_images(images, wanted, extractor, progress)
+        extracted = extract_images(images, wanted, extractor, describer, progress)
     _check_usable(extracted, images)
     cameras = assign_cameras(images, extracted.images, options.camera)
     with timer.step('match'):
-        retrieval = _describe_images(extracted.images)
+        retrieval = _describe_images(extracted.images, describer)
         matches = _match(extracted.images, retrieval, options, progress)
     camera_is_known = options.camera is not None and not options.refine_camera
     sfm_input = SfmInput(extracted.images, cameras, camera_is_known, matches)
@@ -142,7 +153,8 @@ def build_map(
         content = _content(model.reconstruction, extracted.images, retrieval)
     report = _report(given, wanted, extracted, model, content, timer)
     progress('save', 0, 1)
-    save_map(out, content, _manifest(images, extractor, options, report), model.reconstruction)
+    manifest = _manifest(images, extractor, retrieval.describer, options, report)
+    save_map(out, content, manifest, model.reconstruction)
     progress('save', 1, 1)
     return report
 
@@ -195,12 +207,16 @@ def _check_usable(extracted: ExtractedImages, folder: Path) -> None:
         raise MapBuildError(msg)
 
 
-def _describe_images(images: Sequence[MappingImage]) -> _Retrieval:
-    vlad = Vlad.train(np.concatenate([image.features.descriptors for image in images]))
-    return _Retrieval(
-        vlad=vlad,
-        global_descriptors=np.stack([vlad.describe(one.features.descriptors) for one in images]),
-    )
+def _describe_images(
+    images: Sequence[MappingImage], describer: GlobalDescriptor | None
+) -> _Retrieval:
+    if describer is None:
+        vlad = Vlad.train(np.concatenate([image.features.descriptors for image in images]))
+        described = [vlad.aggregate(image.features.descriptors) for image in images]
+        return _Retrieval(vlad, np.stack(described), vlad.codebook)
+    dimension = images[0].features.descriptors.shape[1]
+    described = [one.global_descriptor for one in images if one.global_descriptor is not None]
+    return _Retrieval(describer, np.stack(described), np.zeros((0, dimension), np.float32))
 
 
 def _match(
@@ -307,7 +323,7 @@ def _content(
         observation_offsets=described.observation_offsets,
         observation_points=described.observation_points,
         global_descriptors=retrieval.global_descriptors[rows],
-        codebook=retrieval.vlad.codebook,
+        codebook=retrieval.codebook,
     )
 
 
@@ -343,14 +359,19 @@ def _report(
 
 
 def _manifest(
-    images: Path, extractor: LocalExtractor, options: MapBuildOptions, report: BuildReport
+    images: Path,
+    extractor: LocalExtractor,
+    describer: GlobalDescriptor,
+    options: MapBuildOptions,
+    report: BuildReport,
 ) -> Manifest:
     frame = MapFrame()
     if options.poses is not None:
         frame = MapFrame(metric=options.poses_are_metric, source='the given camera poses')
     return Manifest(
         extractor=extractor.identity,
-        retrieval=RETRIEVAL_NAME,
+        retrieval=describer.name,
+        retrieval_weights_sha256=describer.weights_sha256,
         frame=frame,
         counts={},
         build={

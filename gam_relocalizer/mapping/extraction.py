@@ -1,6 +1,6 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""Local features of all images of a folder."""
+"""Features of all images of a folder."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor, LocalFeatures
     from gam_relocalizer.mapping.progress import Progress
 
@@ -27,12 +31,14 @@ class MappingImage:
         width: Of the image file [px].
         height: Of the image file [px].
         features: Its local features.
+        global_descriptor: [G], where it is computed from the pixels.
     """
 
     name: str
     width: int
     height: int
     features: LocalFeatures
+    global_descriptor: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -49,9 +55,21 @@ class ExtractedImages:
 
 
 def extract_images(
-    folder: Path, names: Sequence[str], extractor: LocalExtractor, progress: Progress
+    folder: Path,
+    names: Sequence[str],
+    extractor: LocalExtractor,
+    describer: GlobalDescriptor | None,
+    progress: Progress,
 ) -> ExtractedImages:
-    """Reads and describes the named images; one that cannot be read is noted and left out."""
+    """Reads and describes the named images; one that cannot be read is noted and left out.
+
+    Args:
+        folder: The folder of images.
+        names: Relative to it.
+        extractor: Of local features.
+        describer: Of images as a whole; None for one that first has to see all local features.
+        progress: Told of the step extract.
+    """
     images: list[MappingImage] = []
     unreadable: dict[str, str] = {}
     for done, name in enumerate(names, start=1):
@@ -61,6 +79,8 @@ def extract_images(
             unreadable[name] = str(err)
         else:
             height, width = pixels.shape[:2]
-            images.append(MappingImage(name, width, height, extractor.extract(pixels)))
+            features = extractor.extract(pixels)
+            described = None if describer is None else describer.describe(pixels, features)
+            images.append(MappingImage(name, width, height, features, described))
         progress('extract', done, len(names))
     return ExtractedImages(tuple(images), unreadable)

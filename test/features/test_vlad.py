@@ -21,7 +21,7 @@ VLAD = Vlad.train(unit_vectors(2000), words=16)
 
 @given(count=st.integers(1, 200), seed=st.integers(0, 1000))
 def test_length_is_one(count: int, seed: int) -> None:
-    described = VLAD.describe(unit_vectors(count, seed=seed))
+    described = VLAD.aggregate(unit_vectors(count, seed=seed))
 
     assert described.shape == (VLAD.dimension,) == (16 * 8,)
     assert np.linalg.norm(described) == pytest.approx(1.0, abs=1e-5)
@@ -32,21 +32,21 @@ def test_order_and_repetition_do_not_matter(seed: int) -> None:
     descriptors = unit_vectors(50, seed=seed)
     shuffled = np.random.default_rng(seed).permutation(descriptors)
 
-    expected = VLAD.describe(descriptors)
+    expected = VLAD.aggregate(descriptors)
 
-    np.testing.assert_allclose(VLAD.describe(shuffled), expected, atol=1e-5)
-    np.testing.assert_allclose(VLAD.describe(np.repeat(descriptors, 3, 0)), expected, atol=1e-5)
+    np.testing.assert_allclose(VLAD.aggregate(shuffled), expected, atol=1e-5)
+    np.testing.assert_allclose(VLAD.aggregate(np.repeat(descriptors, 3, 0)), expected, atol=1e-5)
 
 
 def test_no_descriptors_give_zero() -> None:
-    np.testing.assert_array_equal(VLAD.describe(unit_vectors(0)), np.zeros(VLAD.dimension))
+    np.testing.assert_array_equal(VLAD.aggregate(unit_vectors(0)), np.zeros(VLAD.dimension))
 
 
 def test_same_place_is_nearer_than_another() -> None:
     place, other = unit_vectors(300, seed=1), unit_vectors(300, seed=2)
     again = place[:200] + 0.05 * unit_vectors(200, seed=3)
 
-    similarity = VLAD.describe(again) @ np.stack([VLAD.describe(place), VLAD.describe(other)]).T
+    similarity = VLAD.aggregate(again) @ np.stack([VLAD.aggregate(place), VLAD.aggregate(other)]).T
 
     assert similarity[0] > similarity[1] + 0.2
 
