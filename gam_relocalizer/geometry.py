@@ -131,19 +131,18 @@ def skew(vector: ArrayLike) -> NDArray[np.float64]:
 def covariance_of_map_from_camera(
     camera_from_map: pycolmap.Rigid3d, covariance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariance of the camera's pose in the map, from that of the inverse transform.
+    """Covariance of the camera's pose in the map, from that of its movements in its own frame.
 
     Args:
         camera_from_map: The estimate.
-        covariance: [6,6], rotation then translation of `camera_from_map`, perturbed as
-            R <- exp(delta) R and t <- t + delta (the order of pycolmap).
+        covariance: [6,6] of small rotations about and then small shifts along the camera's axes,
+            that is of `camera_from_map` <- exp(movement) * `camera_from_map`.
 
     Returns:
         [6,6] in the order of REP-103: x, y, z, rotations about the fixed x, y, z axes of the map.
     """
     map_from_camera_rotation = rotation_of(camera_from_map).as_matrix().T
     jacobian = np.zeros((6, 6))
-    jacobian[:3, :3] = -map_from_camera_rotation @ skew(camera_from_map.translation)
     jacobian[:3, 3:] = -map_from_camera_rotation
     jacobian[3:, :3] = -map_from_camera_rotation
     return symmetric(jacobian @ covariance @ jacobian.T)

@@ -9,7 +9,7 @@
     observation_offsets.npy   [I+1] int64: image i sees observation_points[offsets[i]:offsets[i+1]]
     observation_points.npy    int32 indices into points
     global.npy                [I,G] float32 global descriptors of the reference images
-    codebook.npy              [W,D] float32 words of the global descriptor
+    codebook.npy              [W,D] float32 words of VLAD; none with another global descriptor
     sfm/                      the COLMAP model (optional at run time)
 
 A bundle is untrusted input: nothing is unpickled, sizes and sums are compared with the manifest,
@@ -21,7 +21,7 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,6 +124,8 @@ class Manifest:
         build: Inputs, options, software versions and results of the build.
         files: Every file of the bundle but the manifest itself, by relative name.
         format_version: Version of this layout.
+        retrieval_weights_sha256: Sum of the weights of the global descriptor, or empty when it has
+            none.
     """
 
     extractor: ExtractorIdentity
@@ -133,6 +135,7 @@ class Manifest:
     build: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, FileEntry] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
+    retrieval_weights_sha256: str = ''
 
     @property
     def map_id(self) -> str:
@@ -153,7 +156,7 @@ class MapContent:
         observation_offsets: [I+1] int64.
         observation_points: [nnz] int32.
         global_descriptors: [I,G] float32.
-        codebook: [W,D] float32.
+        codebook: [W,D] float32, the words of VLAD; W = 0 with another global descriptor.
     """
 
     image_names: tuple[str, ...]
@@ -180,7 +183,7 @@ class SceneMap:
         observation_offsets: [I+1] int64.
         observation_points: [nnz] int32.
         global_descriptors: [I,G] float32.
-        codebook: [W,D] float32.
+        codebook: [W,D] float32, the words of VLAD; W = 0 with another global descriptor.
     """
 
     path: Path
@@ -205,14 +208,29 @@ class SceneMap:
         return self.observation_points[begin:end]
 
     @cached_property
+    def camera_positions(self) -> NDArray[np.float64]:
+        """[I,3] where the reference images were taken, map frame."""
+        positions = [pose.tgt_origin_in_src() for pose in self.camera_from_map]
+        return np.array(positions, np.float64).reshape(-1, 3)
+
+    @cached_property
     def covisibility(self) -> csr_matrix:
         """[I,I] int32: number of points that two reference images share (beta in the paper)."""
+        return csr_matrix(self._observed @ self._observed.T)
+
+    @cached_property
+    def observers(self) -> csr_matrix:
+        """[N,I] int32: 1 where a reference image (column) observes a point (row)."""
+        return csr_matrix(self._observed.T)
+
+    @property
+    def _observed(self) -> csr_matrix:
+        """[I,N] int32: 1 where a reference image (row) observes a point (column)."""
         ones = np.ones(len(self.observation_points), dtype=np.int32)
-        observed = csr_matrix(
+        return csr_matrix(
             (ones, self.observation_points, self.observation_offsets),
             shape=(self.num_images, len(self.points)),
         )
-        return csr_matrix(observed @ observed.T)
 
 
 def save_map(
@@ -331,7 +349,7 @@ def verify_files(path: Path, manifest: Manifest, names: Iterator[str]) -> None:
         if size != expected.size:
             msg = f'{file}: {size} bytes, expected {expected.size}; it is truncated or changed'
             raise MapError(msg)
-        if _sha256(file) != expected.sha256:
+        if sha256_of(file) != expected.sha256:
             msg = f'{file}: its contents differ from what was built (sha256); copy the map again'
             raise MapError(msg)
 
@@ -357,18 +375,15 @@ def _write_bundle(
     }
     for name, (array, dtype) in arrays.items():
         np.save(folder / f'{name}.npy', np.ascontiguousarray(array, dtype=dtype))
-    complete = Manifest(
-        extractor=manifest.extractor,
-        retrieval=manifest.retrieval,
-        frame=manifest.frame,
+    complete = replace(
+        manifest,
         counts={
             'images': len(content.image_names),
             'points': len(content.points),
             'observations': len(content.observation_points),
         },
-        build=manifest.build,
         files={
-            file.relative_to(folder).as_posix(): FileEntry(file.stat().st_size, _sha256(file))
+            file.relative_to(folder).as_posix(): FileEntry(file.stat().st_size, sha256_of(file))
             for file in sorted(folder.rglob('*'))
             if file.is_file()
         },
@@ -417,6 +432,8 @@ def _manifest_from(data: Mapping[str, Any]) -> Manifest:
         counts=counts,
         build=dict(data['build']),
         files=files,
+        # maps of releases that knew VLAD alone do not have it
+        retrieval_weights_sha256=str(data.get('retrieval_weights_sha256', '')),
     )
 
 
@@ -491,7 +508,8 @@ def _is_sfm(name: str) -> bool:
     return name.startswith(f'{SFM}/')
 
 
-def _sha256(file: Path) -> str:
+def sha256_of(file: Path) -> str:
+    """Sum of a file's bytes, as `sha256sum` prints it."""
     digest = hashlib.sha256()
     with file.open('rb') as stream:
         while block := stream.read(_HASH_BLOCK):

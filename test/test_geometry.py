@@ -142,10 +142,9 @@ def test_covariance_of_the_inverse_matches_samples() -> None:
     camera_from_map = rigid3d_from(rng.normal(size=4), [3.0, -2.0, 5.0])
     covariance = random_covariance(rng)
     deltas = rng.multivariate_normal(np.zeros(6), covariance, 20_000)
-    rotation = rotation_of(camera_from_map)
     samples = [
-        rigid3d_from_rotation(
-            Rotation.from_rotvec(delta[:3]) * rotation, camera_from_map.translation + delta[3:]
+        (
+            rigid3d_from_rotation(Rotation.from_rotvec(delta[:3]), delta[3:]) * camera_from_map
         ).inverse()
         for delta in deltas
     ]

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,9 @@ import numpy as np
 import poselib
 import pycolmap
 
-from gam_relocalizer.geometry import covariance_of_map_from_camera, rigid3d_from
+from gam_relocalizer.cameras import undistort
+from gam_relocalizer.geometry import rigid3d_from
+from gam_relocalizer.localization.covariance import cauchy_scale, pose_covariance
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,10 +22,6 @@ if TYPE_CHECKING:
 REFERENCE_SIDE = 1024.0
 MIN_MATCHES = 4
 REFINEMENTS = 4
-# Cauchy's loss keeps 95 % of the efficiency of least squares at this many standard deviations.
-CAUCHY_SCALE = 2.385
-# Median length of a 2D Gaussian of unit variance (Rayleigh distribution).
-RAYLEIGH_MEDIAN = 1.1774
 # The share of the best matches that the noise is guessed from, and the length of a 2D Gaussian
 # of unit variance below which that share lies.
 BEST_SHARE = 0.1
@@ -34,17 +31,6 @@ INLIER_SIGMAS = 3.0
 NEAREST_SHARE = 0.5
 # Inliers may be tightened down to this share of the threshold of the search.
 TIGHTEST = 1.0 / 3.0
-# Keypoints are found on a grid of pixels and points were triangulated from such keypoints: however
-# well a few inliers agree, a coordinate is not better known than this.
-MIN_SIGMA_PX = 0.5
-# pycolmap's rotation covariance is that of Ceres' quaternion tangent: half the rotation vector.
-FULL_ANGLE = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
-# Beyond so many pixels from where a keypoint was, its ray is not the inverse of its projection.
-ROUND_TRIP_PX = 0.5
-# Rays further off the axis run away on the image plane, which ends at 90 degrees.
-MAX_TANGENT = math.tan(math.radians(80.0))
-# Ceres wants a loss; beyond this scale Cauchy's is least squares.
-NO_LOSS_PX = 1e9
 
 
 @dataclass(frozen=True)
@@ -56,12 +42,14 @@ class PoseOptions:
             the refinement tightens it as far as the noise allows.
         min_iterations: Least number of samples drawn.
         max_iterations: Greatest number of samples drawn; bounds the time of a hopeless query.
+        guided: Whether matches of greater weight are sampled first; else all alike.
         seed: Of the sampler.
     """
 
     max_error: float = 12.0
-    min_iterations: int = 500
+    min_iterations: int = 100
     max_iterations: int = 10_000
+    guided: bool = True
     seed: int = 0
 
 
@@ -72,14 +60,17 @@ class AbsolutePose:
     Attributes:
         camera_from_map: The estimate.
         covariance: [6,6] of map_from_camera, order of REP-103, positive definite.
-        inliers: [K] mask over the matches, those within three standard deviations of the noise.
+        inliers: [K] mask over the matches, those within three standard deviations of the noise; no
+            keypoint and no point is in two of them.
         errors: [K] reprojection errors [px]; infinite for points that the camera cannot see.
+        iterations: Samples that the search drew.
     """
 
     camera_from_map: pycolmap.Rigid3d
     covariance: NDArray[np.float64]
     inliers: NDArray[np.bool_]
     errors: NDArray[np.float64]
+    iterations: int
 
 
 def estimate_pose(
@@ -89,6 +80,7 @@ def estimate_pose(
     camera: pycolmap.Camera,
     options: PoseOptions | None = None,
     nearest: NDArray[np.bool_] | None = None,
+    covariances: NDArray[np.float64] | None = None,
 ) -> AbsolutePose | None:
     """Prior-guided PnP in a RANSAC loop, then robust refinement on the inliers.
 
@@ -103,37 +95,54 @@ def estimate_pose(
         camera: Any model of COLMAP.
         options: How to search.
         nearest: [K] `Matches.nearest`; all of them if not given.
+        covariances: [K,3,3] of the points, see `point_covariances`; zero if not given.
 
     Returns:
         The pose, or nothing where the matches do not determine one.
     """
     options = options or PoseOptions()
-    if len(keypoints) < MIN_MATCHES:
+    # what is said twice counts once
+    ends = np.hstack([keypoints, points])
+    distinct = np.flatnonzero(_heaviest_of_each(ends, np.asarray(weights, np.float64)))
+    if len(distinct) < MIN_MATCHES:
         return None
-    local = _LocalFrame.around(points)
+    local = _LocalFrame.around(points[distinct])
     matches = _Matches(
-        keypoints=np.asarray(keypoints, np.float64),
-        points=local.from_map(points),
+        keypoints=np.asarray(keypoints[distinct], np.float64),
+        points=local.from_map(points[distinct]),
+        weights=np.asarray(weights[distinct], np.float64),
         camera=camera,
         threshold=options.max_error * max(camera.width, camera.height) / REFERENCE_SIDE,
-        nearest=np.ones(len(keypoints), np.bool_) if nearest is None else nearest,
+        nearest=np.ones(len(distinct), np.bool_) if nearest is None else nearest[distinct],
     )
-    camera_from_local = _search(matches, weights, options)
-    if camera_from_local is None:
+    found = _search(matches, options)
+    if found is None:
         return None
+    camera_from_local, iterations = found
     refined = _refine(camera_from_local, matches)
     if refined is None:
         return None
-    covariance = local.covariance_to_map(
-        covariance_of_map_from_camera(refined.camera_from_local, refined.covariance)
+    camera_from_map = local.pose_to_map(refined.camera_from_local)
+    exact = distinct[refined.exact]
+    covariance = pose_covariance(
+        camera_from_map,
+        np.asarray(keypoints[exact], np.float64),
+        points[exact],
+        np.zeros((len(exact), 3, 3)) if covariances is None else covariances[exact],
+        camera,
     )
-    if not _is_positive_definite(covariance):
+    if covariance is None or not _is_positive_definite(covariance):
         return None
+    inliers = np.zeros(len(keypoints), np.bool_)
+    inliers[distinct[refined.inliers]] = True
     return AbsolutePose(
-        camera_from_map=local.pose_to_map(refined.camera_from_local),
+        camera_from_map=camera_from_map,
         covariance=covariance,
-        inliers=refined.inliers,
-        errors=refined.errors,
+        inliers=inliers,
+        errors=reprojection_errors(
+            camera_from_map, np.asarray(keypoints, np.float64), points, camera
+        ),
+        iterations=iterations,
     )
 
 
@@ -152,28 +161,6 @@ def reprojection_errors(
         errors[visible] = np.linalg.norm(projected - keypoints[visible], axis=1)
     errors[np.isnan(errors)] = np.inf
     return errors
-
-
-def undistort(keypoints: NDArray[np.floating], camera: pycolmap.Camera) -> NDArray[np.float64]:
-    """Where the rays of keypoints cut the plane at unit depth.
-
-    Args:
-        keypoints: [K,2] pixels, COLMAP convention.
-        camera: Any model with a focal length.
-
-    Returns:
-        [K,2]; NaN for rays more than 80 degrees off the axis and for keypoints that no ray projects
-        to. COLMAP itself answers with a wrong ray for many of them, as in a fisheye's corners.
-    """
-    pixels = np.asarray(keypoints, np.float64).reshape(-1, 2)
-    if not len(pixels):
-        return pixels
-    on_plane = np.asarray(camera.cam_from_img(pixels), np.float64)
-    projected = np.asarray(camera.img_from_cam(np.column_stack([on_plane, np.ones(len(pixels))])))
-    offset = np.linalg.norm(projected - pixels, axis=1)
-    tangent = np.linalg.norm(on_plane, axis=1)
-    known = (offset < ROUND_TRIP_PX) & (tangent < MAX_TANGENT)
-    return np.where(known[:, None], on_plane, np.nan)
 
 
 @dataclass(frozen=True)
@@ -198,11 +185,6 @@ class _LocalFrame:
         translation = self.unit * camera_from_local.translation - rotation * self.centre
         return pycolmap.Rigid3d(rotation=rotation, translation=translation)
 
-    def covariance_to_map(self, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-        scale = np.array([self.unit] * 3 + [1.0] * 3)
-        scaled: NDArray[np.float64] = covariance * np.outer(scale, scale)
-        return scaled
-
 
 @dataclass(frozen=True)
 class _Matches:
@@ -210,9 +192,21 @@ class _Matches:
 
     keypoints: NDArray[np.float64]
     points: NDArray[np.float64]
+    weights: NDArray[np.float64]
     camera: pycolmap.Camera
     threshold: float
     nearest: NDArray[np.bool_]
+
+    def inliers(self, errors: NDArray[np.float64], threshold: float) -> NDArray[np.bool_]:
+        """Matches [K] within the threshold, the heaviest of each keypoint and of each point.
+
+        Not the closest ones: residuals that were chosen for being small would make the pose look
+        more certain than it is.
+        """
+        inliers = errors <= threshold
+        for ends in (self.keypoints, self.points):
+            inliers &= _heaviest_of_each(ends, np.where(inliers, self.weights, -np.inf))
+        return inliers
 
     def exact(self, inliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """The inliers [K] to refine with: the nearest ones, unless they are the minority."""
@@ -241,21 +235,23 @@ class _Matches:
 
 @dataclass(frozen=True)
 class _Refined:
-    """Pose and covariance (order and perturbation of pycolmap) in the local frame."""
+    """A pose in the local frame, its inliers [K] and those that it was refined with."""
 
     camera_from_local: pycolmap.Rigid3d
-    covariance: NDArray[np.float64]
     inliers: NDArray[np.bool_]
+    exact: NDArray[np.bool_]
     errors: NDArray[np.float64]
 
 
-def _search(
-    matches: _Matches, weights: NDArray[np.floating], options: PoseOptions
-) -> pycolmap.Rigid3d | None:
-    """RANSAC on keypoints of an ideal camera, so that every camera model of COLMAP is served."""
+def _search(matches: _Matches, options: PoseOptions) -> tuple[pycolmap.Rigid3d, int] | None:
+    """RANSAC on keypoints of an ideal camera, so that every camera model of COLMAP is served.
+
+    Returns:
+        The pose, and how many samples were drawn for it.
+    """
     ideal, ideal_keypoints = _without_distortion(matches.keypoints, matches.camera)
     usable = np.asarray(np.isfinite(ideal_keypoints).all(axis=1), np.bool_)
-    by_weight = np.argsort(-np.asarray(weights, np.float64), kind='stable')
+    by_weight = np.argsort(-matches.weights, kind='stable')
     by_weight = by_weight[usable[by_weight]]
     if len(by_weight) < MIN_MATCHES:
         return None
@@ -267,7 +263,7 @@ def _search(
             'max_reproj_error': matches.threshold,
             'min_iterations': options.min_iterations,
             'max_iterations': options.max_iterations,
-            'progressive_sampling': True,
+            'progressive_sampling': options.guided,
             'max_prosac_iterations': options.max_iterations,
             'seed': options.seed,
         },
@@ -275,7 +271,7 @@ def _search(
     )
     if info['num_inliers'] < MIN_MATCHES or not np.isfinite([*found.q, *found.t]).all():
         return None
-    return rigid3d_from(found.q, found.t)
+    return rigid3d_from(found.q, found.t), int(info['iterations'])
 
 
 def _without_distortion(
@@ -304,72 +300,40 @@ def _refine(camera_from_local: pycolmap.Rigid3d, matches: _Matches) -> _Refined 
     threshold = matches.threshold
     for _ in range(REFINEMENTS):
         errors = matches.errors(camera_from_local)
-        inliers = errors <= threshold
+        inliers = matches.inliers(errors, threshold)
         if np.count_nonzero(inliers) < MIN_MATCHES:
             return None
         exact = matches.exact(inliers)
-        refined = _minimise(camera_from_local, matches, exact, _cauchy_scale(errors[exact]))
+        refined = pycolmap.refine_absolute_pose(
+            camera_from_local,
+            matches.keypoints,
+            matches.points,
+            exact,
+            matches.camera,
+            pycolmap.AbsolutePoseRefinementOptions(
+                gradient_tolerance=1e-6, loss_function_scale=cauchy_scale(errors[exact])
+            ),
+        )
         if refined is None:
             return None
-        camera_from_local, _ = refined
+        camera_from_local = refined['cam_from_world']
         threshold = matches.tightened_threshold(matches.errors(camera_from_local))
     errors = matches.errors(camera_from_local)
-    inliers = errors <= threshold
+    inliers = matches.inliers(errors, threshold)
     if np.count_nonzero(inliers) < MIN_MATCHES:
         return None
-    exact = matches.exact(inliers)
-    unit_noise = _minimise(camera_from_local, matches, exact, NO_LOSS_PX, iterations=0)
-    if unit_noise is None:
-        return None
-    variance = _variance_of_cauchy_estimate(errors[exact])
-    covariance = variance * (FULL_ANGLE @ unit_noise[1] @ FULL_ANGLE)
-    return _Refined(camera_from_local, covariance, inliers, errors)
+    return _Refined(camera_from_local, inliers, matches.exact(inliers), errors)
 
 
-def _minimise(
-    camera_from_local: pycolmap.Rigid3d,
-    matches: _Matches,
-    inliers: NDArray[np.bool_],
-    loss_scale: float,
-    iterations: int = 100,
-) -> tuple[pycolmap.Rigid3d, NDArray[np.float64]] | None:
-    """The refined pose, and its covariance for noise of one pixel."""
-    options = pycolmap.AbsolutePoseRefinementOptions(
-        gradient_tolerance=1e-6, loss_function_scale=loss_scale, max_num_iterations=iterations
-    )
-    result = pycolmap.refine_absolute_pose(
-        camera_from_local,
-        matches.keypoints,
-        matches.points,
-        inliers,
-        matches.camera,
-        options,
-        return_covariance=True,
-    )
-    if result is None or result.get('covariance') is None:
-        return None
-    return result['cam_from_world'], np.asarray(result['covariance'])
-
-
-def _cauchy_scale(errors: NDArray[np.float64]) -> float:
-    """Scale of the loss from the errors' own spread [px]."""
-    sigma = float(np.median(errors)) / RAYLEIGH_MEDIAN
-    return CAUCHY_SCALE * max(sigma, MIN_SIGMA_PX)
-
-
-def _variance_of_cauchy_estimate(errors: NDArray[np.float64]) -> float:
-    """Factor on the covariance of least squares with unit noise [px^2].
-
-    Huber's covariance of an M-estimator, mean(psi^2) / mean(psi')^2, for residuals in two
-    dimensions; with Cauchy's weight w the divergence of psi is 2 w^2. For Gaussian errors this is
-    their variance and 5 %; heavy tails raise it less than they raise the plain variance.
-    """
-    count = len(errors)
-    weight = 1.0 / (1.0 + np.square(errors / _cauchy_scale(errors)))
-    mean_psi_squared = np.mean(np.square(weight * errors)) / 2.0
-    variance = mean_psi_squared / np.square(np.mean(np.square(weight)))
-    small_sample = 2 * count / max(2 * count - 6, 1)
-    return float(max(variance * small_sample, MIN_SIGMA_PX**2))
+def _heaviest_of_each(
+    ends: NDArray[np.floating], weights: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Which matches [K] have the greatest weight of all with the same ends, rows of [K,D]."""
+    by_weight = np.argsort(-weights, kind='stable')
+    _, first = np.unique(ends[by_weight], axis=0, return_index=True)
+    heaviest = np.zeros(len(ends), np.bool_)
+    heaviest[by_weight[first]] = True
+    return heaviest
 
 
 def _is_positive_definite(matrix: NDArray[np.float64]) -> bool:

@@ -58,11 +58,8 @@ def test_covariance_matches_samples_from_the_camera_to_the_base() -> None:
     pose = robot_pose(estimate, MOUNT, EXACT)
     moves, turns = [], []
     for delta in rng.multivariate_normal(np.zeros(6), covariance, 20_000):
-        perturbed_camera_from_map = rigid3d_from_rotation(
-            Rotation.from_rotvec(delta[:3]) * rotation_of(camera_from_map),
-            camera_from_map.translation + delta[3:],
-        )
-        map_from_base = (MOUNT * perturbed_camera_from_map).inverse()
+        movement = rigid3d_from_rotation(Rotation.from_rotvec(delta[:3]), delta[3:])
+        map_from_base = (MOUNT * movement * camera_from_map).inverse()
         moves.append(map_from_base.translation - pose.map_from_base.translation)
         turns.append(rotation_of(map_from_base))
     turned = Rotation.concatenate(turns) * rotation_of(pose.map_from_base).inv()
