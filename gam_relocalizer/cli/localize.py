@@ -17,7 +17,12 @@ from rich.progress import track
 from rich.table import Table
 
 from gam_relocalizer.cameras import parse_camera
-from gam_relocalizer.cli.options import DEFAULT_MATCHER, MatcherOption, WeightsOption
+from gam_relocalizer.cli.options import (
+    DEFAULT_MATCHER,
+    GlobalWeightsOption,
+    MatcherOption,
+    WeightsOption,
+)
 from gam_relocalizer.errors import ImageError, UsageError
 from gam_relocalizer.geometry import (
     pose_error,
@@ -35,6 +40,7 @@ if TYPE_CHECKING:
 
     from gam_relocalizer.evaluation.metrics import Accuracy
     from gam_relocalizer.localization.localizer import Localizer
+    from gam_relocalizer.localization.prior import Prior
     from gam_relocalizer.localization.result import LocalizationResult, Timings
 
 STAGES = ('extraction', 'retrieval', 'matching', 'pose', 'total')
@@ -48,11 +54,12 @@ class Query:
     result: LocalizationResult
 
 
-def localize(
+def localize(  # noqa: PLR0913 - the options of the command
     images: Annotated[
         list[Path],
         typer.Argument(help='Images, or folders of images.', metavar='IMAGES_OR_DIR...'),
     ],
+    *,
     map_path: Annotated[Path, typer.Option('--map', help='Map bundle to localize in.')],
     camera: Annotated[
         str, typer.Option(help='File or text `MODEL WIDTH HEIGHT PARAMS...`, the form of COLMAP.')
@@ -66,6 +73,18 @@ def localize(
     ] = None,
     matcher: MatcherOption = DEFAULT_MATCHER,
     weights: WeightsOption = None,
+    global_weights: GlobalWeightsOption = None,
+    near: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            help='Where in the map the camera is thought to be. It is looked for there first, then '
+            'everywhere.',
+            metavar='X Y Z',
+        ),
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(help='How far off that may be, in units of the map.')
+    ] = None,
 ) -> None:
     """Localize images in a map; the poses are camera_from_map.
 
@@ -74,14 +93,15 @@ def localize(
     """
     from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
 
-    parsed_camera = parse_camera(camera)
+    parsed_camera, prior = parse_camera(camera), _prior(near, radius)
     files = _named_files(images)
     true_poses = None if truth is None else read_poses(truth)
     for output in filter(None, (out, jsonl)):
         _prepare_output(output)
-    localizer = Localizer.load(map_path, LocalizerOptions(matcher=matcher, weights=weights))
+    options = LocalizerOptions(matcher=matcher, weights=weights, global_weights=global_weights)
+    localizer = Localizer.load(map_path, options)
     queries = [
-        Query(name, _localize_file(localizer, file, parsed_camera))
+        Query(name, _localize_file(localizer, file, parsed_camera, prior))
         for name, file in track(files.items(), description='localizing', transient=True)
     ]
     poses = _accepted_poses(queries)
@@ -158,14 +178,27 @@ def _prepare_output(path: Path) -> None:
         raise UsageError(msg) from err
 
 
-def _localize_file(localizer: Localizer, file: Path, camera: pycolmap.Camera) -> LocalizationResult:
+def _prior(near: tuple[float, float, float] | None, radius: float | None) -> Prior:
+    from gam_relocalizer.localization.prior import PositionHint, Prior
+
+    if near is None and radius is None:
+        return Prior()
+    if near is None or radius is None:
+        msg = '--near and --radius go together; give both, for example `--near 1 2 0 --radius 3`'
+        raise UsageError(msg)
+    return Prior(hint=PositionHint(np.array(near), radius))
+
+
+def _localize_file(
+    localizer: Localizer, file: Path, camera: pycolmap.Camera, prior: Prior
+) -> LocalizationResult:
     from gam_relocalizer.localization.result import LocalizationResult, Status
 
     try:
         image = read_image(file)
     except ImageError as err:
         return LocalizationResult(Status.UNDECODABLE_IMAGE, str(err))
-    return localizer.localize(image, camera)
+    return localizer.localize(image, camera, prior)
 
 
 def _accepted_poses(queries: Sequence[Query]) -> dict[str, pycolmap.Rigid3d]:

@@ -8,33 +8,32 @@ import time
 from collections import defaultdict
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gam_relocalizer.cameras import have_known_rays
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.features.registry import (
     DEFAULT_MAX_KEYPOINTS,
     EXTRACTOR_NAMES,
     create_extractor,
+    global_descriptor_of,
 )
-from gam_relocalizer.features.vlad import RETRIEVAL_NAME, Vlad
-from gam_relocalizer.localization.pose import (
-    MIN_MATCHES,
-    PoseOptions,
-    estimate_pose,
-    undistort,
-)
+from gam_relocalizer.features.vlad import Vlad
+from gam_relocalizer.localization.covariance import point_covariances
+from gam_relocalizer.localization.pose import MIN_MATCHES, PoseOptions, estimate_pose
+from gam_relocalizer.localization.prior import Prior, tilt_deg
 from gam_relocalizer.localization.result import (
     LocalizationResult,
     PoseEstimate,
     Status,
     Timings,
 )
-from gam_relocalizer.localization.retrieval import retrieve
-from gam_relocalizer.localization.scenes import expanded_scenes, orientation_kept
+from gam_relocalizer.localization.scenes import Coarse, orientation_kept
+from gam_relocalizer.localization.search import candidates, search
 from gam_relocalizer.localization.verdict import (
+    Verdict,
     VerdictOptions,
     coverage_of,
     judge,
@@ -52,15 +51,13 @@ if TYPE_CHECKING:
     import pycolmap
     from numpy.typing import NDArray
 
+    from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor, LocalFeatures
+    from gam_relocalizer.localization.prior import Gravity
     from gam_relocalizer.localization.scenes import Scene
-    from gam_relocalizer.localization.verdict import Verdict
+    from gam_relocalizer.localization.search import Candidate
     from gam_relocalizer.matching.matcher import Matcher, Matches
     from gam_relocalizer.scene_map import SceneMap
-
-# A scene whose image looks this much as alike as the best one is tried even when a pose is found:
-# it may be the same thing in another place.
-COMPETING_SCORE = 0.95
 
 
 @dataclass(frozen=True)
@@ -70,12 +67,14 @@ class LocalizerOptions:
     Attributes:
         retrieved_images: Reference images retrieved (R in the paper).
         scene_images: Images in an expanded scene (m in the paper).
-        max_scenes: Scenes tried before giving up.
+        max_scenes: Scenes tried before giving up; as many before them near a hint.
+        coarse: How retrieved images become scenes.
         enough_inliers: An accepted pose with so many inliers ends the search (early stop), but for
             scenes that look as alike.
         max_keypoints: Local features taken from the image, when the localizer is loaded.
         matcher: One of `MATCHER_NAMES`, when the localizer is loaded.
         weights: Of a learned matcher instead of the shipped ones, when the localizer is loaded.
+        global_weights: Of the map's global descriptor, when it has any and the localizer is loaded.
         pose: How poses are searched.
         verdict: What a pose must show.
     """
@@ -83,10 +82,12 @@ class LocalizerOptions:
     retrieved_images: int = 10
     scene_images: int = 20
     max_scenes: int = 5
+    coarse: Coarse = Coarse.EXPANDED
     enough_inliers: int = 200
     max_keypoints: int = DEFAULT_MAX_KEYPOINTS
     matcher: str = DEFAULT_MATCHER
     weights: Path | None = None
+    global_weights: Path | None = None
     pose: PoseOptions = field(default_factory=PoseOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
 
@@ -100,26 +101,27 @@ class Localizer:
         extractor: LocalExtractor,
         matcher: Matcher,
         options: LocalizerOptions | None = None,
+        describer: GlobalDescriptor | None = None,
     ) -> None:
-        """Puts the parts together.
+        """Puts the parts together; without a `describer` images are retrieved by the map's VLAD.
 
         Raises:
-            MapError: The map was made with another extractor or another retrieval.
+            MapError: The map was made with another local or global descriptor.
         """
-        _check_identity(scene_map, extractor)
+        self._describer = describer or Vlad(scene_map.codebook)
+        _check_identity(scene_map, extractor, self._describer)
         self._scene_map = scene_map
         self._extractor = extractor
         self._matcher = matcher
         self._options = options or LocalizerOptions()
-        self._vlad = Vlad(scene_map.codebook)
 
     @classmethod
     def load(cls, map_path: Path, options: LocalizerOptions | None = None) -> Localizer:
-        """Loads a map, the extractor that it names and the matcher that the options name.
+        """Loads a map, the descriptors that it names and the matcher that the options name.
 
         Raises:
-            MapError: The map is damaged, or made with an extractor that is not available here.
-            UsageError: The matcher is unknown, or weights are given to one that has none.
+            MapError: The map is damaged, or made with descriptors or weights that are not here.
+            UsageError: The matcher is unknown, or weights are given to what has none.
             WeightsError: Weights are missing, damaged, or made for other descriptors.
         """
         options = options or LocalizerOptions()
@@ -133,7 +135,8 @@ class Localizer:
             raise MapError(msg)
         matcher = create_matcher(options.matcher, weights=options.weights, extractor=name)
         extractor = create_extractor(name, options.max_keypoints)
-        return cls(scene_map, extractor, matcher, options)
+        describer = global_descriptor_of(scene_map, options.global_weights)
+        return cls(scene_map, extractor, matcher, options, describer)
 
     @property
     def scene_map(self) -> SceneMap:
@@ -142,14 +145,17 @@ class Localizer:
 
     def with_options(self, options: LocalizerOptions) -> Localizer:
         """The same map and networks under other options; what was for loading changes nothing."""
-        return Localizer(self._scene_map, self._extractor, self._matcher, options)
+        return Localizer(self._scene_map, self._extractor, self._matcher, options, self._describer)
 
-    def localize(self, image: NDArray[np.uint8], camera: pycolmap.Camera) -> LocalizationResult:
+    def localize(
+        self, image: NDArray[np.uint8], camera: pycolmap.Camera, prior: Prior | None = None
+    ) -> LocalizationResult:
         """Finds the pose of the camera that took an image.
 
         Args:
             image: RGB [H,W,3] or grey [H,W].
             camera: Its intrinsics and distortion; the image is used as it is, never resampled.
+            prior: What else is known about the camera's pose.
 
         Returns:
             Always a result; look at `accepted` before acting on its estimate.
@@ -158,12 +164,40 @@ class Localizer:
             return unusable
         clock = _Clock()
         with clock.stage('extraction'):
-            features = _seen_by(camera, self._extractor.extract(image))
-        result = self._localize_features(features, camera, clock)
-        return replace(result, keypoints=len(features), timings=clock.timings())
+            features = self._extractor.extract(image)
+        with clock.stage('retrieval'):
+            described = self._describer.describe(image, features)
+        return self._localize_described(features, described, camera, prior or Prior(), clock)
+
+    def localize_features(
+        self,
+        features: LocalFeatures,
+        described: NDArray[np.float32],
+        camera: pycolmap.Camera,
+        prior: Prior | None = None,
+    ) -> LocalizationResult:
+        """The same for an image whose local features and global descriptor are known already."""
+        return self._localize_described(features, described, camera, prior or Prior(), _Clock())
+
+    def _localize_described(
+        self,
+        features: LocalFeatures,
+        described: NDArray[np.float32],
+        camera: pycolmap.Camera,
+        prior: Prior,
+        clock: _Clock,
+    ) -> LocalizationResult:
+        seen = _seen_by(camera, features)
+        result = self._localize_features(seen, described, camera, prior, clock)
+        return replace(result, keypoints=len(seen), timings=clock.timings())
 
     def _localize_features(
-        self, features: LocalFeatures, camera: pycolmap.Camera, clock: _Clock
+        self,
+        features: LocalFeatures,
+        described: NDArray[np.float32],
+        camera: pycolmap.Camera,
+        prior: Prior,
+        clock: _Clock,
     ) -> LocalizationResult:
         needed = self._options.verdict.min_inliers
         if len(features) < needed:
@@ -172,34 +206,18 @@ class Localizer:
                 f'{len(features)} local features in the image, needs {needed}; it may be black, '
                 f'blurred or without texture',
             )
-        with clock.stage('retrieval'):
-            retrieved = retrieve(
-                self._vlad.describe(features.descriptors),
-                self._scene_map,
-                self._options.retrieved_images,
-            )
-        scenes = expanded_scenes(
-            retrieved.images.tolist(), self._scene_map, self._options.scene_images
+        ordered = candidates(described, self._scene_map, self._options, prior.hint)
+        attempts = search(
+            _timed(ordered, clock),
+            lambda scene: self._localize_in(scene, features, camera, prior.gravity, clock),
+            self._options.enough_inliers,
         )
-        scores = dict(zip(retrieved.images.tolist(), retrieved.scores.tolist(), strict=True))
-        attempts: list[LocalizationResult] = []
-        for scene in islice(_timed(scenes, clock), self._options.max_scenes):
-            competes = scores[scene.image] >= COMPETING_SCORE * max(scores.values())
-            if self._is_settled(attempts) and not competes:
-                break
-            attempts.append(self._localize_in(scene, features, camera, clock))
         if not attempts:
             return LocalizationResult(
                 Status.NO_SCENE,
                 f'no reference image was retrieved; the map has {self._scene_map.num_images}',
             )
         return replace(self._uncontested(attempts), scenes_tried=len(attempts))
-
-    def _is_settled(self, attempts: Sequence[LocalizationResult]) -> bool:
-        return any(
-            attempt.accepted and attempt.inliers >= self._options.enough_inliers
-            for attempt in attempts
-        )
 
     def _uncontested(self, attempts: Sequence[LocalizationResult]) -> LocalizationResult:
         """The best attempt; rejected when another scene speaks nearly as loud for another pose."""
@@ -216,13 +234,20 @@ class Localizer:
         return best
 
     def _localize_in(
-        self, scene: Scene, features: LocalFeatures, camera: pycolmap.Camera, clock: _Clock
+        self,
+        scene: Scene,
+        features: LocalFeatures,
+        camera: pycolmap.Camera,
+        gravity: Gravity | None,
+        clock: _Clock,
     ) -> LocalizationResult:
         with clock.stage('matching'):
             matches = self._match(scene, features, camera)
         name = self._scene_map.image_names[scene.image]
         result = LocalizationResult(
-            Status.TOO_FEW_MATCHES, matches=len(matches.weights), scene=name
+            Status.TOO_FEW_MATCHES,
+            matches=len(np.unique(matches.keypoint_indices)),
+            scene=name,
         )
         needed = max(MIN_MATCHES, self._options.verdict.min_inliers)
         if result.matches < needed:
@@ -233,15 +258,25 @@ class Localizer:
         if estimate is None:
             reason = f'the {result.matches} matches with the scene around `{name}` fit no pose'
             return replace(result, status=Status.NO_POSE, reason=reason)
-        verdict = self._judge(estimate, scene)
+        verdict = self._judge(estimate, scene, gravity)
         return replace(result, status=verdict.status, reason=verdict.reason, estimate=estimate)
 
-    def _judge(self, estimate: PoseEstimate, scene: Scene) -> Verdict:
+    def _judge(self, estimate: PoseEstimate, scene: Scene, gravity: Gravity | None) -> Verdict:
         kept = orientation_kept(
             estimate.camera_from_map, estimate.inlier_points, scene, self._scene_map
         )
         points = self._scene_map.points[estimate.inlier_points]
-        return judge(estimate, points, kept, self._options.verdict)
+        verdict = judge(estimate, points, kept, self._options.verdict)
+        if gravity is None or verdict.status is not Status.ACCEPTED:
+            return verdict
+        tilt = tilt_deg(estimate.camera_from_map, gravity)
+        if tilt <= gravity.tolerance_deg:
+            return verdict
+        return Verdict(
+            Status.IMPLAUSIBLE,
+            f'{verdict.reason}; the pose is tilted by {tilt:.1f} deg against gravity, allowed are '
+            f'{gravity.tolerance_deg:.1f} deg',
+        )
 
     def _match(self, scene: Scene, features: LocalFeatures, camera: pycolmap.Camera) -> Matches:
         # the matcher wants points as a camera near the query sees them
@@ -272,6 +307,7 @@ class Localizer:
             camera,
             self._options.pose,
             matches.nearest,
+            point_covariances(self._scene_map, points),
         )
         if pose is None:
             return None
@@ -281,7 +317,7 @@ class Localizer:
             covariance=pose.covariance,
             inlier_keypoints=inlier_keypoints,
             inlier_points=points[pose.inliers],
-            inlier_ratio=len(inlier_keypoints) / len(keypoints),
+            inlier_ratio=len(inlier_keypoints) / len(np.unique(matches.keypoint_indices)),
             coverage=coverage_of(inlier_keypoints, camera),
             reprojection_error=float(np.sqrt(np.mean(np.square(pose.errors[pose.inliers])))),
         )
@@ -305,7 +341,7 @@ class _Clock:
         return Timings(**self._milliseconds)
 
 
-def _timed(scenes: Iterator[Scene], clock: _Clock) -> Iterator[Scene]:
+def _timed(scenes: Iterator[Candidate], clock: _Clock) -> Iterator[Candidate]:
     """Scenes are computed when asked for: their time belongs to the retrieval."""
     while True:
         with clock.stage('retrieval'):
@@ -340,7 +376,7 @@ def _unusable(image: NDArray[np.uint8], camera: pycolmap.Camera) -> Localization
 
 def _seen_by(camera: pycolmap.Camera, features: LocalFeatures) -> LocalFeatures:
     """Features whose viewing ray the camera model knows; a fisheye's corners may have none."""
-    known = np.isfinite(undistort(features.keypoints, camera)).all(axis=1)
+    known = have_known_rays(features.keypoints, camera)
     return replace(
         features,
         keypoints=features.keypoints[known],
@@ -349,7 +385,9 @@ def _seen_by(camera: pycolmap.Camera, features: LocalFeatures) -> LocalFeatures:
     )
 
 
-def _check_identity(scene_map: SceneMap, extractor: LocalExtractor) -> None:
+def _check_identity(
+    scene_map: SceneMap, extractor: LocalExtractor, describer: GlobalDescriptor
+) -> None:
     made_with, present = scene_map.manifest.extractor, extractor.identity
     if made_with != present:
         msg = (
@@ -357,11 +395,17 @@ def _check_identity(scene_map: SceneMap, extractor: LocalExtractor) -> None:
             f'extractors cannot be compared: build the map again with this one'
         )
         raise MapError(msg)
-    codebook, described = scene_map.codebook, scene_map.global_descriptors
-    if scene_map.manifest.retrieval != RETRIEVAL_NAME or codebook.size != described.shape[1]:
+    manifest, length = scene_map.manifest, scene_map.global_descriptors.shape[1]
+    described_by = manifest.retrieval, manifest.retrieval_weights_sha256, length
+    here = describer.name, describer.weights_sha256, describer.dimension
+    if described_by != here:
         msg = (
-            f'{scene_map.path}: its global descriptors are `{scene_map.manifest.retrieval}` of '
-            f'length {described.shape[1]}; expected `{RETRIEVAL_NAME}` of length {codebook.size}, '
-            f'the size of its codebook'
+            f'{scene_map.path}: its global descriptors are {_in_words(*described_by)}, here is '
+            f'{_in_words(*here)}; give the weights that the map was built with, or build it again'
         )
         raise MapError(msg)
+
+
+def _in_words(name: str, weights_sha256: str, length: int) -> str:
+    weights = f' with weights of sha256 {weights_sha256}' if weights_sha256 else ''
+    return f'`{name}` of length {length}{weights}'

@@ -33,6 +33,8 @@ class Status(Enum):
     UNCERTAIN = 17
     IMPLAUSIBLE = 18
     AMBIGUOUS = 19
+    CONTRADICTED = 20
+    MISCALIBRATED = 21
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,8 @@ class LocalizationResult:
         matches: Number of one-to-one matches in the scene that decided.
         scene: Name of the reference image whose scene decided, or empty.
         scenes_tried: Number of scenes matched.
+        confidence: Probability that the best pose found is within 0.25 m and 2 degrees of the
+            truth (map units where the map is not metric), 0 without one.
         timings: Time per stage.
     """
 
@@ -102,6 +106,7 @@ class LocalizationResult:
     matches: int = 0
     scene: str = ''
     scenes_tried: int = 0
+    confidence: float = 0.0
     timings: Timings = field(default_factory=Timings)
 
     @property

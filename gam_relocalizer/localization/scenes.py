@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum, unique
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError
 
 if TYPE_CHECKING:
@@ -19,19 +21,54 @@ if TYPE_CHECKING:
     from gam_relocalizer.scene_map import SceneMap
 
 
+@unique
+class Coarse(Enum):
+    """From retrieved images to scenes: the ways that Table II of the paper compares.
+
+    `EXPANDED` (SR) expands each retrieved image by its most covisible ones. `TOGETHER` (IR) makes
+    one scene of all retrieved images. `CLUSTERS` (CC; Sarlin et al., CVPR 2019) joins retrieved
+    images that see common points, transitively, and takes the largest cluster first.
+    """
+
+    EXPANDED = 'expanded'
+    TOGETHER = 'together'
+    CLUSTERS = 'clusters'
+
+
 @dataclass(frozen=True)
 class Scene:
-    """An expanded scene of the paper.
+    """Reference images, and the points that a query is matched with.
 
     Attributes:
-        image: The retrieved reference image it was expanded from.
-        images: [m] int64 reference images in it, most covisible first; `image` leads.
+        image: The retrieved image that looks most like the query. The matcher gets the points in
+            the frame of its camera, the best guess where the query was taken.
+        images: [m] int64 reference images in it, `image` first: then the most covisible ones, or
+            the retrieved ones by descending score.
         points: [N] int64 indices of the points these images see, ascending and unique.
     """
 
     image: int
     images: NDArray[np.int64]
     points: NDArray[np.int64]
+
+
+def scenes_of(
+    retrieved_images: Iterable[int], scene_map: SceneMap, coarse: Coarse, size: int
+) -> Iterator[Scene]:
+    """Makes scenes of retrieved images, on demand and in the order in which they are to be tried.
+
+    Args:
+        retrieved_images: Indices of reference images by descending score.
+        scene_map: The map.
+        coarse: The way.
+        size: Most images in an expanded scene; the other ways take all images they are given.
+    """
+    if coarse is Coarse.EXPANDED:
+        return expanded_scenes(retrieved_images, scene_map, size)
+    images = np.array(list(dict.fromkeys(retrieved_images)), np.int64)
+    if coarse is Coarse.TOGETHER:
+        return iter([_scene_of(images, scene_map)] if len(images) else [])
+    return (_scene_of(cluster, scene_map) for cluster in covisible_clusters(images, scene_map))
 
 
 def expanded_scenes(
@@ -53,8 +90,7 @@ def expanded_scenes(
             continue
         images = most_covisible(int(image), scene_map, size)
         appeared.update(images.tolist())
-        seen = [scene_map.points_seen_by(index) for index in images]
-        yield Scene(int(image), images, np.unique(np.concatenate(seen)).astype(np.int64))
+        yield _scene_of(images, scene_map)
 
 
 def most_covisible(image: int, scene_map: SceneMap, size: int) -> NDArray[np.int64]:
@@ -68,6 +104,23 @@ def most_covisible(image: int, scene_map: SceneMap, size: int) -> NDArray[np.int
     neighbours, shared = row.indices[others], row.data[others]
     order = np.lexsort((neighbours, -shared))[: size - 1]
     return np.concatenate([[image], neighbours[order]]).astype(np.int64)
+
+
+def covisible_clusters(images: NDArray[np.int64], scene_map: SceneMap) -> list[NDArray[np.int64]]:
+    """Joins images that share a point, transitively (Sarlin et al., CVPR 2019).
+
+    Args:
+        images: [R] int64, unique, by descending score.
+        scene_map: The map.
+
+    Returns:
+        Clusters, each by descending score; the largest first, ties by the better first image.
+    """
+    shared = scene_map.covisibility[images][:, images]
+    count, cluster_of = connected_components(shared, directed=False)
+    clusters = [images[cluster_of == cluster] for cluster in range(count)]
+    rank = {int(image): position for position, image in enumerate(images)}
+    return sorted(clusters, key=lambda cluster: (-len(cluster), rank[int(cluster[0])]))
 
 
 def orientation_kept(
@@ -101,6 +154,12 @@ def orientation_kept(
         return 0.0
     same = _signed_areas(on_reference[triangles]) * _signed_areas(on_query[triangles]) > 0
     return float(np.mean(same))
+
+
+def _scene_of(images: NDArray[np.int64], scene_map: SceneMap) -> Scene:
+    """The scene of some images, the best retrieved one first."""
+    seen = [scene_map.points_seen_by(image) for image in images]
+    return Scene(int(images[0]), images, np.unique(np.concatenate(seen)).astype(np.int64))
 
 
 def _signed_areas(triangles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -143,6 +143,39 @@ def test_matcher_is_the_one_named(run: Run, tiny_place: TinyPlace, tmp_path: Pat
     assert pose_error(camera_from_map, truth).position < 0.05
 
 
+@pytest.mark.parametrize('near', [('0', '0', '0'), ('-1e3', '-2.5', '1e3')])
+def test_hint_right_or_wrong_takes_no_fix_away(
+    run: Run, tiny_place: TinyPlace, tmp_path: Path, near: tuple[str, str, str]
+) -> None:
+    out, image = tmp_path / 'poses.txt', run.images / GOOD[0]
+    called = CliRunner().invoke(
+        app, command(tiny_place, image, '--out', out, '--near', *near, '--radius', '1.5')
+    )
+    assert called.exit_code == 0
+    camera_from_map, (_, truth) = read_poses(out)[GOOD[0]], tiny_place.queries[0]
+    assert pose_error(camera_from_map, truth).position < 0.05
+
+
+@pytest.mark.parametrize(
+    'hint',
+    [
+        ['--near', '1', '2', '3'],
+        ['--radius', '2'],
+        ['--near', '1', '2', '3', '--radius', '-2'],
+        ['--near', '1', '2', '3', '--radius', 'nan'],
+        ['--near', '1', 'nan', '3', '--radius', '2'],
+    ],
+)
+def test_hint_that_says_no_place_is_an_error(
+    run: Run, tiny_place: TinyPlace, tmp_path: Path, hint: list[str]
+) -> None:
+    called = CliRunner().invoke(
+        app, command(tiny_place, run.images, '--out', tmp_path / 'poses.txt', *hint)
+    )
+    assert isinstance(called.exception, UsageError)
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_accepted_leaves_an_empty_file_and_exit_code_zero(
     run: Run, tiny_place: TinyPlace, tmp_path: Path
 ) -> None:
@@ -162,6 +195,7 @@ def test_nothing_accepted_leaves_an_empty_file_and_exit_code_zero(
         ({'--matcher': 'best'}, UsageError),
         ({'--matcher': 'nn-cross', '--weights': 'tuned.npz'}, UsageError),
         ({'--weights': 'nowhere.npz'}, WeightsError),
+        ({'--global-weights': 'netvlad.mat'}, UsageError),
     ],
 )
 def test_unusable_arguments_are_errors_and_write_nothing(

@@ -163,7 +163,7 @@ def save_place(
         observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
         observation_points=np.concatenate(seen).astype(np.int32),
         global_descriptors=np.array(
-            [vlad.describe(place.descriptors[visible]) for visible in seen], np.float32
+            [vlad.aggregate(place.descriptors[visible]) for visible in seen], np.float32
         ),
         codebook=vlad.codebook,
     )

@@ -15,10 +15,12 @@ from hypothesis import strategies as st
 from synthetic_place import (
     CAMERA,
     IDENTITY,
+    NUM_IMAGES,
     Place,
     ViewExtractor,
     features_of,
     image_of,
+    looking,
     no_features,
     query_pose,
     save_place,
@@ -28,14 +30,17 @@ from synthetic_place import (
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.geometry import pose_error
 from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
+from gam_relocalizer.localization.prior import Gravity, PositionHint, Prior
 from gam_relocalizer.localization.result import LocalizationResult, Status
+from gam_relocalizer.localization.scenes import Coarse
 from gam_relocalizer.localization.verdict import VerdictOptions
 from gam_relocalizer.matching.baselines import NearestNeighbourRatio
 from gam_relocalizer.scene_map import MapFrame
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
+
+    from numpy.typing import ArrayLike
 
     from gam_relocalizer.features.local import LocalFeatures
     from gam_relocalizer.scene_map import SceneMap
@@ -62,6 +67,13 @@ def scene_map(tmp_path_factory: pytest.TempPathFactory) -> SceneMap:
     return save_place(tmp_path_factory.mktemp('maps') / 'place', PLACE)
 
 
+@pytest.fixture(scope='module')
+def twin_map(tmp_path_factory: pytest.TempPathFactory) -> SceneMap:
+    """The same place twice, the other 100 above the one."""
+    twins, poses = twin_of(PLACE, np.array([0.0, 0.0, 100.0]))
+    return save_place(tmp_path_factory.mktemp('maps') / 'twins', twins, poses=poses)
+
+
 def make_localizer(
     scene_map: SceneMap,
     views: Mapping[int, LocalFeatures],
@@ -73,6 +85,22 @@ def make_localizer(
 def localize(scene_map: SceneMap, features: LocalFeatures, **options: object) -> LocalizationResult:
     localizer = make_localizer(scene_map, {0: features}, LocalizerOptions(**options))
     return localizer.localize(image_of(0), CAMERA)
+
+
+def localize_near(
+    scene_map: SceneMap, view: int, position: ArrayLike, radius: float, **options: object
+) -> LocalizationResult:
+    """Localizes a view of the place with a hint where its camera is."""
+    features = features_of(PLACE, query_pose(view), seed=view)
+    localizer = make_localizer(scene_map, {0: features}, LocalizerOptions(**options))
+    prior = Prior(hint=PositionHint(np.asarray(position, dtype=float), radius))
+    return localizer.localize(image_of(0), CAMERA, prior)
+
+
+def with_retrieval_turned_round(scene_map: SceneMap) -> SceneMap:
+    """Every image of the ring is retrieved by what the opposite one looks like."""
+    turned = np.roll(scene_map.global_descriptors, NUM_IMAGES // 2, axis=0)
+    return replace(scene_map, global_descriptors=turned)
 
 
 def check_invariants(result: LocalizationResult) -> None:
@@ -193,12 +221,101 @@ def test_good_scene_ends_the_search_and_weak_ones_do_not(scene_map: SceneMap) ->
     assert never_enough.accepted
 
 
-def test_same_place_twice_in_the_map_gives_no_fix(tmp_path: Path) -> None:
-    twins, poses = twin_of(PLACE, np.array([0.0, 0.0, 100.0]))
-    scene_map = save_place(tmp_path / 'twins', twins, poses=poses)
-    result = localize(scene_map, features_of(PLACE, query_pose(0), seed=0))
+def test_same_place_twice_in_the_map_gives_no_fix(twin_map: SceneMap) -> None:
+    result = localize(twin_map, features_of(PLACE, query_pose(0), seed=0))
     assert result.status is Status.AMBIGUOUS
     assert result.inliers >= LocalizerOptions().enough_inliers
+
+
+@pytest.mark.parametrize('coarse', list(Coarse))
+def test_every_way_from_images_to_scenes_localizes(scene_map: SceneMap, coarse: Coarse) -> None:
+    for index in range(5):
+        features = features_of(PLACE, query_pose(index), seed=index)
+        result = localize(scene_map, features, coarse=coarse)
+        assert result.accepted
+        assert pose_error(result.estimate.camera_from_map, query_pose(index)).position < 0.05
+
+
+@given(
+    view=st.integers(0, 20),
+    position=st.tuples(*[st.floats(-5.0, 5.0)] * 3) | st.just((1e3, -1e3, 1e3)),
+    radius=st.floats(0.0, 10.0) | st.just(np.inf),
+    coarse=st.sampled_from(Coarse),
+)
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def test_no_hint_takes_a_fix_away_or_moves_it(
+    scene_map: SceneMap,
+    view: int,
+    position: tuple[float, float, float],
+    radius: float,
+    coarse: Coarse,
+) -> None:
+    small = {'coarse': coarse, 'retrieved_images': 3, 'scene_images': 3}
+    without = localize(scene_map, features_of(PLACE, query_pose(view), seed=view), **small)
+    hinted = localize_near(scene_map, view, position, radius, **small)
+    assert hinted.scenes_tried >= without.scenes_tried
+    assert hinted.accepted >= without.accepted
+    if without.accepted:
+        moved = pose_error(hinted.estimate.camera_from_map, without.estimate.camera_from_map)
+        assert moved.position < 0.05
+        assert moved.rotation_deg < 0.5
+
+
+@pytest.mark.parametrize('coarse', list(Coarse))
+def test_hint_at_everything_changes_no_byte(scene_map: SceneMap, coarse: Coarse) -> None:
+    without = localize(scene_map, features_of(PLACE, query_pose(3), seed=3), coarse=coarse)
+    hinted = localize_near(scene_map, 3, [0.0, 0.0, 0.0], np.inf, coarse=coarse)
+    assert replace(hinted, estimate=None, timings=None) == (
+        replace(without, estimate=None, timings=None)
+    )
+    assert hinted.estimate.camera_from_map.matrix().tobytes() == (
+        without.estimate.camera_from_map.matrix().tobytes()
+    )
+
+
+def test_hint_finds_a_place_that_the_retrieval_missed(scene_map: SceneMap) -> None:
+    misled = with_retrieval_turned_round(scene_map)
+    yaw = 0.4
+    pose = looking(yaw, np.array([np.cos(yaw), np.sin(yaw), 0.0]))
+    views = {0: features_of(PLACE, pose, seed=0)}
+    localizer = make_localizer(misled, views, LocalizerOptions(retrieved_images=3, scene_images=3))
+    assert not localizer.localize(image_of(0), CAMERA).accepted
+    hint = PositionHint(pose.tgt_origin_in_src() + 0.05, 0.3)
+    hinted = localizer.localize(image_of(0), CAMERA, Prior(hint=hint))
+    assert hinted.accepted
+    assert pose_error(hinted.estimate.camera_from_map, pose).position < 0.05
+
+
+@pytest.mark.parametrize('coarse', list(Coarse))
+@pytest.mark.parametrize('height', [0.0, 100.0], ids=['right', 'wrong'])
+def test_hint_at_one_of_two_places_that_look_alike_gives_no_fix(
+    twin_map: SceneMap, coarse: Coarse, height: float
+) -> None:
+    for view in range(2):
+        result = localize_near(twin_map, view, [0.0, 0.0, height], 5.0, coarse=coarse)
+        assert not result.accepted
+        if coarse is not Coarse.TOGETHER:  # both places in one scene leave no unique match
+            assert result.status is Status.AMBIGUOUS
+
+
+@pytest.mark.parametrize(
+    ('up_in_camera', 'status'),
+    [
+        ([0.0, -9.81, 0.0], Status.ACCEPTED),
+        ([0.0, 1.0, 0.0], Status.IMPLAUSIBLE),
+        ([1.0, -1.0, 0.0], Status.IMPLAUSIBLE),
+    ],
+    ids=['level', 'upside down', 'rolled'],
+)
+def test_pose_against_gravity_is_implausible(
+    scene_map: SceneMap, up_in_camera: list[float], status: Status
+) -> None:
+    views = {0: features_of(PLACE, looking(0.7, np.zeros(3)), seed=0)}
+    prior = Prior(gravity=Gravity(np.array(up_in_camera), 15.0))
+    result = make_localizer(scene_map, views).localize(image_of(0), CAMERA, prior)
+    check_invariants(result)
+    assert result.status is status
+    assert result.estimate is not None
 
 
 def test_best_rejected_pose_is_kept_with_its_reason(scene_map: SceneMap) -> None:

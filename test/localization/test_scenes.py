@@ -13,12 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gam_relocalizer.geometry import rigid3d_from
-from gam_relocalizer.localization.retrieval import retrieve
+from gam_relocalizer.localization.prior import PositionHint
+from gam_relocalizer.localization.retrieval import images_near, retrieve
 from gam_relocalizer.localization.scenes import (
+    Coarse,
     Scene,
+    covisible_clusters,
     expanded_scenes,
     most_covisible,
     orientation_kept,
+    scenes_of,
 )
 from gam_relocalizer.scene_map import ExtractorIdentity, Manifest, MapFrame, SceneMap
 
@@ -60,6 +64,40 @@ def test_small_maps_and_empty_descriptors_retrieve_what_they_can() -> None:
     assert len(retrieve(np.ones(4, np.float32), make_map([], 0), 10)) == 0
 
 
+def test_retrieves_only_among_the_images_it_may_choose_from() -> None:
+    described = [[0.0, 1.0], [1.0, 0.0], [0.6, 0.8], [1.0, 0.0]]
+    scene_map = make_map([[0]] * 4, 1, described)
+    query = np.array([1.0, 0.0], np.float32)
+    among = np.array([True, False, True, True])
+    assert retrieve(query, scene_map, 2, among).images.tolist() == [3, 2]
+    assert list(retrieve(query, scene_map, 10, among).by_image()) == [3, 2, 0]
+    assert len(retrieve(query, scene_map, 10, np.zeros(4, bool))) == 0
+
+
+@pytest.mark.parametrize(
+    ('position', 'radius', 'near'),
+    [
+        ([2.1, 0.0, 0.0], 0.0, [2]),
+        ([2.1, 0.0, 0.0], 1.0, [1, 2, 3]),
+        ([2.0, 0.5, 0.0], 0.2, [2]),  # no camera within the radius itself
+        ([50.0, 0.0, 0.0], 1.5, [2, 3]),  # outside the map
+        ([0.0, 0.0, 0.0], np.inf, [0, 1, 2, 3]),
+    ],
+)
+def test_radius_is_counted_from_the_nearest_camera(
+    position: list[float], radius: float, near: list[int]
+) -> None:
+    turned = [0.5, 0.5, -0.5, 0.5]
+    in_a_row = tuple(rigid3d_from(turned, [x, 0, 0]).inverse() for x in range(4))
+    scene_map = replace(make_map([[0]] * 4, 1), camera_from_map=in_a_row)
+    hint = PositionHint(np.array(position), radius)
+    assert np.flatnonzero(images_near(hint, scene_map)).tolist() == near
+
+
+def test_nothing_is_near_in_an_empty_map() -> None:
+    assert len(images_near(PositionHint(np.zeros(3), 1.0), make_map([], 0))) == 0
+
+
 def test_expansion_is_not_transitive() -> None:
     (scene,) = expanded_scenes([0], CHAIN, size=20)
     assert scene.images.tolist() == [0, 1]
@@ -96,6 +134,36 @@ def test_image_without_points_gives_an_empty_scene() -> None:
     (scene,) = expanded_scenes([0], scene_map, size=5)
     assert scene.images.tolist() == [0]
     assert len(scene.points) == 0
+
+
+def test_expanded_scenes_are_those_of_the_paper() -> None:
+    scenes = list(scenes_of([3, 1], CHAIN, Coarse.EXPANDED, size=2))
+    assert [scene.images.tolist() for scene in scenes] == [[3], [1, 0]]
+
+
+def test_together_is_one_scene_led_by_the_best_image() -> None:
+    (scene,) = scenes_of([2, 0, 3, 2], CHAIN, Coarse.TOGETHER, size=1)
+    assert scene.image == 2
+    assert scene.images.tolist() == [2, 0, 3]
+    assert scene.points.tolist() == [0, 1, 2, 4, 5, 6, 7]
+
+
+def test_clusters_are_transitive_and_the_largest_comes_first() -> None:
+    scenes = list(scenes_of([3, 2, 0, 1], CHAIN, Coarse.CLUSTERS, size=1))
+    assert [scene.image for scene in scenes] == [2, 3]
+    assert [scene.images.tolist() for scene in scenes] == [[2, 0, 1], [3]]
+    assert scenes[0].points.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_clusters_join_by_retrieved_images_only() -> None:
+    # 0 and 2 share points with 1 only, which was not retrieved
+    scenes = list(scenes_of([2, 3, 0], CHAIN, Coarse.CLUSTERS, size=20))
+    assert [scene.images.tolist() for scene in scenes] == [[2], [3], [0]]
+
+
+@pytest.mark.parametrize('coarse', list(Coarse))
+def test_nothing_retrieved_gives_no_scene(coarse: Coarse) -> None:
+    assert not list(scenes_of([], CHAIN, coarse, size=20))
 
 
 def test_orientation_is_kept_in_front_of_a_wall_and_lost_behind_it() -> None:
@@ -142,3 +210,27 @@ def test_laws_of_expansion(seen: list[set[int]], size: int, seed: int) -> None:
         assert scene.points.tolist() == sorted(set().union(*(seen[i] for i in scene.images)))
         appeared |= set(scene.images.tolist())
     assert appeared == set(range(len(seen)))
+
+
+@given(
+    seen=st.lists(st.sets(st.integers(0, 15)), min_size=1, max_size=8),
+    seed=st.integers(0, 100),
+)
+def test_laws_of_clusters(seen: list[set[int]], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene_map = make_map([sorted(points) for points in seen], 16)
+    images = rng.permutation(len(seen))[: rng.integers(1, len(seen) + 1)]
+    clusters = covisible_clusters(images, scene_map)
+    rank = {image: position for position, image in enumerate(images)}
+    assert sorted(np.concatenate(clusters)) == sorted(images)
+    points = [set().union(*(seen[image] for image in cluster)) for cluster in clusters]
+    for one, cluster in enumerate(clusters):
+        assert [rank[image] for image in cluster] == sorted(rank[image] for image in cluster)
+        assert all(not points[one] & points[other] for other in range(one))
+        reached, todo = set(), {cluster[0]}
+        while todo:
+            reached |= todo
+            todo = {i for i in set(cluster) - reached if any(seen[i] & seen[j] for j in reached)}
+        assert reached == set(cluster)
+    order = [(-len(cluster), rank[cluster[0]]) for cluster in clusters]
+    assert order == sorted(order)
