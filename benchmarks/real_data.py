@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from gam_relocalizer.cameras import parse_camera
+from gam_relocalizer.evaluation.localization import world_from_map_of
 from gam_relocalizer.evaluation.metrics import accuracy
 from gam_relocalizer.geometry import PoseError, pose_error, read_poses
 from gam_relocalizer.images import list_images, read_image
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from gam_relocalizer.localization.result import LocalizationResult
     from gam_relocalizer.mapping.report import BuildReport
-    from gam_relocalizer.scene_map import SceneMap
 
 SETS = ('redkitchen', 'castle-p30', 'fountain-p11', 'fox')
 # The calibration that comes with these is nominal; structure from motion refines it.
@@ -67,46 +66,36 @@ def main() -> None:
     print(_table(outcomes))
 
 
-def _run(folder: Path, map_path: Path, mapped_from: str) -> Outcome:
-    """Maps a set and localizes its queries."""
-    true_mapping = read_poses(folder / 'poses_mapping.txt')
-    truth = read_poses(folder / 'poses_query.txt')
+def map_set(folder: Path, map_path: Path, mapped_from: str) -> BuildReport:
+    """Builds the map of a set from its `poses`, or from `images` alone."""
     options = MapBuildOptions(
         camera=parse_camera(folder / 'camera.txt'),
-        poses=true_mapping if mapped_from == 'poses' else None,
+        poses=read_poses(folder / 'poses_mapping.txt') if mapped_from == 'poses' else None,
         refine_camera=folder.name in NOMINAL_CAMERAS,
     )
-    report = build_map(folder / 'mapping', map_path, options)
+    return build_map(folder / 'mapping', map_path, options)
+
+
+def _run(folder: Path, map_path: Path, mapped_from: str) -> Outcome:
+    """Maps a set and localizes its queries."""
+    report = map_set(folder, map_path, mapped_from)
+    truth = read_poses(folder / 'poses_query.txt')
     camera = parse_camera(report.cameras[0])
     localizer = Localizer.load(map_path)
-    true_from_map = _true_from_map(localizer.scene_map, true_mapping)
+    true_mapping = read_poses(folder / 'poses_mapping.txt')
+    world_from_map = world_from_map_of(localizer.scene_map, true_mapping)
     results = {
         name: localizer.localize(read_image(folder / 'query' / name), camera)
         for name in list_images(folder / 'query')
     }
     poses = {
-        name: true_from_map.transform_camera_world(result.estimate.camera_from_map)
+        name: world_from_map.transform_camera_world(result.estimate.camera_from_map)
         for name, result in results.items()
         if result.accepted and result.estimate is not None
     }
     errors = tuple(pose_error(poses[name], truth[name]) for name in poses)
     print(f'{folder.name} from {mapped_from}: {len(errors)} of {len(results)}', flush=True)
     return Outcome(folder.name, mapped_from, report, results, errors)
-
-
-def _true_from_map(
-    scene_map: SceneMap, true_mapping: Mapping[str, pycolmap.Rigid3d]
-) -> pycolmap.Sim3d:
-    """The similarity that lays the map's cameras over the true ones; identity for given poses."""
-    if scene_map.manifest.frame.metric:
-        return pycolmap.Sim3d()
-    in_map = [pose.tgt_origin_in_src() for pose in scene_map.camera_from_map]
-    in_truth = [true_mapping[name].tgt_origin_in_src() for name in scene_map.image_names]
-    fitted = pycolmap.estimate_sim3d(np.array(in_map), np.array(in_truth))
-    if fitted is None:
-        msg = f'{scene_map.path}: no similarity lays its cameras over the true ones'
-        raise RuntimeError(msg)
-    return fitted
 
 
 def _table(outcomes: list[Outcome]) -> str:

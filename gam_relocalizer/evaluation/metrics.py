@@ -41,6 +41,8 @@ THRESHOLDS = (
     Threshold(0.5, 5.0),
     Threshold(5.0, 10.0),
 )
+CORRECT = Threshold(0.25, 2.0)
+"""A pose this good is what a confidence promises, see `LocalizationResult`."""
 
 
 @dataclass(frozen=True)
