@@ -154,7 +154,7 @@ class TransformTree:
             raise TransformError(msg)
         begin, end = edge.stamps[after - 1], edge.stamps[after]
         share = (stamp_ns - begin) / (end - begin)
-        return _interpolate(edge.samples[after - 1], edge.samples[after], share)
+        return interpolated(edge.samples[after - 1], edge.samples[after], share)
 
     def _describe(self) -> str:
         edges = sorted(f'{edge.parent} -> {child}' for child, edge in self._edges.items())
@@ -183,9 +183,16 @@ def _below(line: list[str], ancestor: str) -> list[str]:
     return line[: line.index(ancestor)]
 
 
-def _interpolate(
+def interpolated(
     before: pycolmap.Rigid3d, after: pycolmap.Rigid3d, share: float
 ) -> pycolmap.Rigid3d:
+    """Between two samples: the translation linearly, the rotation spherically.
+
+    Args:
+        before: The earlier sample.
+        after: The later sample.
+        share: Of the way from one to the other, 0 to 1.
+    """
     rotations = Rotation.concatenate([rotation_of(before), rotation_of(after)])
     rotation = Slerp([0.0, 1.0], rotations)(share)
     return rigid3d_from_rotation(

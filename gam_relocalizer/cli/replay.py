@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +15,12 @@ from rich.progress import Progress
 from rich.table import Table
 
 from gam_relocalizer.cameras import format_camera, parse_camera
-from gam_relocalizer.cli.options import DEFAULT_MATCHER, MatcherOption, WeightsOption
+from gam_relocalizer.cli.options import (
+    DEFAULT_MATCHER,
+    GlobalWeightsOption,
+    MatcherOption,
+    WeightsOption,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -44,6 +50,10 @@ def replay(  # noqa: PLR0913 - the options of the command
     camera_info_topic: Annotated[
         str | None, typer.Option(help='CameraInfo; by default the one beside the image topic.')
     ] = None,
+    odom_topic: Annotated[
+        str | None,
+        typer.Option(help='Odometry of the base; fixes that it speaks against are held back.'),
+    ] = None,
     truth_topic: Annotated[
         str | None, typer.Option(help='True poses of the base in the map frame, to compare with.')
     ] = None,
@@ -60,11 +70,13 @@ def replay(  # noqa: PLR0913 - the options of the command
     ] = False,
     matcher: MatcherOption = DEFAULT_MATCHER,
     weights: WeightsOption = None,
+    global_weights: GlobalWeightsOption = None,
 ) -> None:
     """Localize the images of a bag as the node would, and report on it.
 
     Attempts that are refused are no failure of the command: their reasons are in the report.
     """
+    from gam_relocalizer.localization.continuity import ContinuityOptions
     from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
     from gam_relocalizer.replay.replay import ReplayOptions, replay_bag
     from gam_relocalizer.replay.report import Report, write_report
@@ -83,17 +95,22 @@ def replay(  # noqa: PLR0913 - the options of the command
         camera=None if camera is None else parse_camera(camera),
         image_topic=image_topic,
         camera_info_topic=camera_info_topic,
+        odometry_topic=odom_topic,
         truth_topic=truth_topic,
         image_is_rectified=image_is_rectified,
     )
-    localizer_options = LocalizerOptions(matcher=matcher, weights=weights)
+    localizer_options = LocalizerOptions(
+        matcher=matcher, weights=weights, global_weights=global_weights
+    )
     with output_folder(out) as folder:
         localizer = Localizer.load(map_path, localizer_options)
         scene_map = localizer.scene_map
+        metric = scene_map.manifest.frame.metric
+        options = replace(options, continuity=ContinuityOptions(metric=metric))
         with _progress(scene_map) as progress:
             replayed = replay_bag(bag, localizer, options, progress)
         rows = [row_of(attempt) for attempt in replayed.attempts]
-        facts = _facts(bag, scene_map, options, replayed) | _matcher_facts(localizer_options)
+        facts = _facts(bag, scene_map, options, replayed) | _network_facts(localizer_options)
         report = Report(
             title=f'Replay of {bag.resolve().name}',
             rows=rows,
@@ -137,6 +154,7 @@ def _facts(
         'period': options.period,
         'image_topic': replayed.image_topic,
         'camera_info_topic': options.camera_info_topic,
+        'odometry_topic': options.odometry_topic,
         'truth_topic': options.truth_topic,
         'base_frame': options.base_frame,
         'map_frame': options.map_frame,
@@ -145,10 +163,12 @@ def _facts(
     }
 
 
-def _matcher_facts(options: LocalizerOptions) -> dict[str, Any]:
+def _network_facts(options: LocalizerOptions) -> dict[str, Any]:
+    weights, global_weights = options.weights, options.global_weights
     return {
         'matcher': options.matcher,
-        'weights': None if options.weights is None else options.weights.resolve().name,
+        'weights': None if weights is None else weights.resolve().name,
+        'global_weights': None if global_weights is None else global_weights.resolve().name,
     }
 
 

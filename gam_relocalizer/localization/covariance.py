@@ -102,7 +102,7 @@ def pose_covariance(
     known = np.isfinite(projected).all(axis=1) & np.isfinite(across).all(axis=(1, 2))
     keypoints, in_camera, across = keypoints[known], in_camera[known], across[known]
     residuals = projected[known] - keypoints
-    jacobians = np.concatenate([-across @ _skews(in_camera), across], axis=2)
+    jacobians = movement_jacobians(in_camera, across)
 
     spread = _spread_by_points(camera_from_map, across, covariances[known], camera)
     variance = _noise_variance(residuals, spread)
@@ -126,9 +126,14 @@ def pose_covariance(
     return covariance_of_map_from_camera(camera_from_map, covariance)
 
 
+def sigma_of(errors: NDArray[np.float64]) -> float:
+    """Standard deviation of a coordinate, robustly, from the lengths [K] of errors [px]."""
+    return max(float(np.median(errors)) / RAYLEIGH_MEDIAN, MIN_SIGMA_PX)
+
+
 def cauchy_scale(errors: NDArray[np.float64]) -> float:
     """Scale of the loss from the spread of the errors [K] themselves [px]."""
-    return CAUCHY_SCALE * _sigma_of(errors)
+    return CAUCHY_SCALE * sigma_of(errors)
 
 
 def projection_jacobians(
@@ -154,8 +159,19 @@ def projection_jacobians(
     return np.asarray(camera.img_from_cam(in_camera), np.float64), jacobians
 
 
-def _sigma_of(errors: NDArray[np.float64]) -> float:
-    return max(float(np.median(errors)) / RAYLEIGH_MEDIAN, MIN_SIGMA_PX)
+def movement_jacobians(
+    in_camera: NDArray[np.float64], across: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How projections change when the camera's frame turns and shifts a little.
+
+    Args:
+        in_camera: [K,3] points in the camera's frame.
+        across: [K,2,3] derivatives of their projections, see `projection_jacobians`.
+
+    Returns:
+        [K,2,6], by rotations about and then by shifts along the axes.
+    """
+    return np.concatenate([-across @ _skews(in_camera), across], axis=2)
 
 
 def _spread_by_points(
@@ -181,7 +197,7 @@ def _noise_variance(residuals: NDArray[np.float64], spread: NDArray[np.float64])
     """
     whitened = np.linalg.solve(np.linalg.cholesky(spread), residuals[:, :, None])[:, :, 0]
     lengths = np.linalg.norm(whitened, axis=1)
-    weights = 1.0 / (1.0 + np.square(lengths / (CAUCHY_SCALE * _sigma_of(lengths))))
+    weights = 1.0 / (1.0 + np.square(lengths / (CAUCHY_SCALE * sigma_of(lengths))))
     variance = np.mean(np.square(weights * lengths)) / 2.0 / np.square(np.mean(np.square(weights)))
     degrees = 2 * len(residuals)
     return max(float(variance) * degrees / max(degrees - 6, 1), MIN_SIGMA_PX**2)

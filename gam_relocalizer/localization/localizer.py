@@ -21,7 +21,14 @@ from gam_relocalizer.features.registry import (
     global_descriptor_of,
 )
 from gam_relocalizer.features.vlad import Vlad
+from gam_relocalizer.localization.confidence import (
+    Evidence,
+    belief_in,
+    nearness,
+    scaled_residual,
+)
 from gam_relocalizer.localization.covariance import point_covariances
+from gam_relocalizer.localization.focal_length import focal_length_of
 from gam_relocalizer.localization.pose import MIN_MATCHES, PoseOptions, estimate_pose
 from gam_relocalizer.localization.prior import Prior, tilt_deg
 from gam_relocalizer.localization.result import (
@@ -32,12 +39,15 @@ from gam_relocalizer.localization.result import (
 )
 from gam_relocalizer.localization.scenes import Coarse, orientation_kept
 from gam_relocalizer.localization.search import candidates, search
+from gam_relocalizer.localization.support import support_of
 from gam_relocalizer.localization.verdict import (
-    Verdict,
     VerdictOptions,
     coverage_of,
     judge,
+    judge_focal_length,
+    judge_mirrored,
     judge_rival,
+    judge_tilt,
 )
 from gam_relocalizer.matching.bmnet import normalise_keypoints, normalised_focal_length
 from gam_relocalizer.matching.matcher import MatchInput
@@ -56,6 +66,7 @@ if TYPE_CHECKING:
     from gam_relocalizer.localization.prior import Gravity
     from gam_relocalizer.localization.scenes import Scene
     from gam_relocalizer.localization.search import Candidate
+    from gam_relocalizer.localization.verdict import Verdict
     from gam_relocalizer.matching.matcher import Matcher, Matches
     from gam_relocalizer.scene_map import SceneMap
 
@@ -167,7 +178,15 @@ class Localizer:
             features = self._extractor.extract(image)
         with clock.stage('retrieval'):
             described = self._describer.describe(image, features)
-        return self._localize_described(features, described, camera, prior or Prior(), clock)
+        result = self._localize_described(features, described, camera, prior or Prior(), clock)
+        if not result.accepted:
+            return result
+        with clock.stage('extraction'):
+            verdict = self._judge_mirrored(image, described)
+        timings = clock.timings()
+        if verdict is None:
+            return replace(result, timings=timings)
+        return replace(result, status=verdict.status, reason=verdict.reason, timings=timings)
 
     def localize_features(
         self,
@@ -176,8 +195,26 @@ class Localizer:
         camera: pycolmap.Camera,
         prior: Prior | None = None,
     ) -> LocalizationResult:
-        """The same for an image whose local features and global descriptor are known already."""
+        """The same for an image whose local features and global descriptor are known already.
+
+        Without the image itself nothing can tell whether it is mirrored.
+        """
         return self._localize_described(features, described, camera, prior or Prior(), _Clock())
+
+    def _judge_mirrored(
+        self, image: NDArray[np.uint8], described: NDArray[np.float32]
+    ) -> Verdict | None:
+        """Rejects an image that looks much more like the map when it is mirrored.
+
+        A facade that is symmetric fits its mirror image to the pixel, with hundreds of inliers.
+        """
+        mirrored = np.ascontiguousarray(image[:, ::-1])
+        as_mirrored = self._describer.describe(mirrored, self._extractor.extract(mirrored))
+        references = self._scene_map.global_descriptors
+        likeness, mirrored_likeness = (
+            float(np.max(references @ each)) for each in (described, as_mirrored)
+        )
+        return judge_mirrored(likeness, mirrored_likeness)
 
     def _localize_described(
         self,
@@ -254,28 +291,39 @@ class Localizer:
             reason = f'{result.matches} matches with the scene around `{name}`, needs {needed}'
             return replace(result, reason=reason)
         with clock.stage('pose'):
-            estimate = self._estimate(matches, features.keypoints, scene.points, camera)
+            estimate = self._estimate(matches, features.keypoints, scene, camera)
         if estimate is None:
             reason = f'the {result.matches} matches with the scene around `{name}` fit no pose'
             return replace(result, status=Status.NO_POSE, reason=reason)
-        verdict = self._judge(estimate, scene, gravity)
-        return replace(result, status=verdict.status, reason=verdict.reason, estimate=estimate)
-
-    def _judge(self, estimate: PoseEstimate, scene: Scene, gravity: Gravity | None) -> Verdict:
-        kept = orientation_kept(
-            estimate.camera_from_map, estimate.inlier_points, scene, self._scene_map
+        with clock.stage('pose'):
+            verdict = self._judge(estimate, scene, camera, gravity)
+        return replace(
+            result,
+            status=verdict.status,
+            reason=verdict.reason,
+            estimate=estimate,
+            confidence=estimate.belief * nearness(estimate.covariance),
         )
+
+    def _judge(
+        self,
+        estimate: PoseEstimate,
+        scene: Scene,
+        camera: pycolmap.Camera,
+        gravity: Gravity | None,
+    ) -> Verdict:
+        camera_from_map = estimate.camera_from_map
         points = self._scene_map.points[estimate.inlier_points]
+        kept = orientation_kept(camera_from_map, estimate.inlier_points, scene, self._scene_map)
         verdict = judge(estimate, points, kept, self._options.verdict)
-        if gravity is None or verdict.status is not Status.ACCEPTED:
+        if verdict.status is not Status.ACCEPTED:
             return verdict
-        tilt = tilt_deg(estimate.camera_from_map, gravity)
-        if tilt <= gravity.tolerance_deg:
-            return verdict
-        return Verdict(
-            Status.IMPLAUSIBLE,
-            f'{verdict.reason}; the pose is tilted by {tilt:.1f} deg against gravity, allowed are '
-            f'{gravity.tolerance_deg:.1f} deg',
+        keypoints = estimate.inlier_keypoints.astype(np.float64)
+        focal_length = focal_length_of(camera_from_map, keypoints, points, camera)
+        return (
+            judge_focal_length(focal_length)
+            or (gravity and judge_tilt(tilt_deg(camera_from_map, gravity), gravity.tolerance_deg))
+            or verdict
         )
 
     def _match(self, scene: Scene, features: LocalFeatures, camera: pycolmap.Camera) -> Matches:
@@ -294,12 +342,12 @@ class Localizer:
         self,
         matches: Matches,
         keypoints_in_image: NDArray[np.float32],
-        points_in_scene: NDArray[np.int64],
+        scene: Scene,
         camera: pycolmap.Camera,
     ) -> PoseEstimate | None:
-        """The pose of matches between keypoints and points, the latter as indices into the map."""
+        """The pose of matches between keypoints and points of a scene, and what speaks for it."""
         keypoints = keypoints_in_image[matches.keypoint_indices]
-        points = points_in_scene[matches.point_indices]
+        points = scene.points[matches.point_indices]
         pose = estimate_pose(
             keypoints,
             self._scene_map.points[points],
@@ -311,15 +359,23 @@ class Localizer:
         )
         if pose is None:
             return None
-        inlier_keypoints = keypoints[pose.inliers]
+        inlier_keypoints, inlier_points = keypoints[pose.inliers], points[pose.inliers]
+        support = support_of(
+            pose.camera_from_map, camera, inlier_keypoints, inlier_points, scene, self._scene_map
+        )
+        coverage = coverage_of(inlier_keypoints, camera)
+        error = float(np.sqrt(np.mean(np.square(pose.errors[pose.inliers]))))
+        residual = scaled_residual(error, max(camera.width, camera.height))
         return PoseEstimate(
             camera_from_map=pose.camera_from_map,
             covariance=pose.covariance,
             inlier_keypoints=inlier_keypoints,
-            inlier_points=points[pose.inliers],
+            inlier_points=inlier_points,
             inlier_ratio=len(inlier_keypoints) / len(np.unique(matches.keypoint_indices)),
-            coverage=coverage_of(inlier_keypoints, camera),
-            reprojection_error=float(np.sqrt(np.mean(np.square(pose.errors[pose.inliers])))),
+            coverage=coverage,
+            reprojection_error=error,
+            support=support,
+            belief=belief_in(Evidence(coverage, residual, support.unmatched)),
         )
 
 
@@ -351,9 +407,10 @@ def _timed(scenes: Iterator[Candidate], clock: _Clock) -> Iterator[Candidate]:
         yield scene
 
 
-def _rank(result: LocalizationResult) -> tuple[bool, int, int]:
-    """Accepted before rejected, then by inliers, then by matches."""
-    return result.accepted, result.inliers, result.matches
+def _rank(result: LocalizationResult) -> tuple[bool, float, int]:
+    """Accepted before rejected, then by belief, then by matches."""
+    belief = 0.0 if result.estimate is None else result.estimate.belief
+    return result.accepted, belief, result.matches
 
 
 def _unusable(image: NDArray[np.uint8], camera: pycolmap.Camera) -> LocalizationResult | None:

@@ -53,6 +53,19 @@ class Timings:
 
 
 @dataclass(frozen=True)
+class Support:
+    """How far an image shows what is in view of its pose.
+
+    Attributes:
+        in_view: Points of the map that should be in view.
+        unmatched: Share of them in parts of the image without any inlier, 0 to 1; 1 for none.
+    """
+
+    in_view: int
+    unmatched: float
+
+
+@dataclass(frozen=True)
 class PoseEstimate:
     """A pose with what speaks for it.
 
@@ -65,6 +78,8 @@ class PoseEstimate:
         inlier_ratio: Inliers per match.
         coverage: Share of the image that the inliers spread over, 0 to 1.
         reprojection_error: Root mean square over the inliers [px].
+        support: Whether the image shows what the pose says.
+        belief: Probability that the pose is right, that is of this very place, 0 to 1.
     """
 
     camera_from_map: pycolmap.Rigid3d
@@ -74,6 +89,8 @@ class PoseEstimate:
     inlier_ratio: float
     coverage: float
     reprojection_error: float
+    support: Support
+    belief: float
 
     @property
     def inliers(self) -> int:

@@ -11,17 +11,26 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gam_relocalizer.geometry import pose_error
+from gam_relocalizer.localization.confidence import odds
 from gam_relocalizer.localization.result import PoseEstimate, Status
 
 if TYPE_CHECKING:
     import pycolmap
     from numpy.typing import NDArray
 
+    from gam_relocalizer.localization.focal_length import FocalLength
+
 # Coverage is counted on a grid of so many cells along each side of the image.
 GRID = 8
 # Poses further apart than this contradict each other: share of the distance of the inliers, angle.
-RIVAL_POSITION_SHARE = 0.2
-RIVAL_ROTATION_DEG = 10.0
+RIVAL_POSITION_SHARE = 0.1
+RIVAL_ROTATION_DEG = 5.0
+# A focal length that is off by less than this, or by less than so many standard deviations of what
+# the image tells of it, is no reason to doubt the calibration.
+FOCAL_LENGTH_TOLERANCE = 0.08
+FOCAL_LENGTH_SIGMAS = 4.0
+# Images of a real place were seen to be up to 0.06 more like the map when mirrored.
+MIRROR_MARGIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -42,8 +51,10 @@ class VerdictOptions:
         min_orientation_kept: Least share of triangles of neighbouring points that query and
             reference image see the same way round. Mirrored points of a wall fit a pose behind the
             wall to the pixel.
-        max_rival_share: Most inliers that a contradicting pose from another scene may have, per
-            inlier of the best. Places that look alike (the same poster in two rooms) show up here.
+        min_belief: Least probability that the pose is right, see `confidence.Evidence`.
+        min_odds_against_rival: A contradicting pose from another scene makes the best one
+            ambiguous, unless this has so many times its odds. Places that look alike (the same
+            poster in two rooms) show up here.
     """
 
     min_inliers: int = 25
@@ -52,7 +63,8 @@ class VerdictOptions:
     max_relative_std: float = 0.05
     max_rotation_std_deg: float = 2.0
     min_orientation_kept: float = 0.7
-    max_rival_share: float = 0.8
+    min_belief: float = 0.8
+    min_odds_against_rival: float = 7.5
 
 
 @dataclass(frozen=True)
@@ -117,6 +129,13 @@ def judge(
             f'{orientation_kept:.0%} of their triangles are the same way round as in the reference '
             f'image, needs {options.min_orientation_kept:.0%}; the others are mirrored',
         ),
+        (
+            estimate.belief < options.min_belief,
+            Status.CONTRADICTED,
+            f'{estimate.support.unmatched:.0%} of what should be in view is where nothing matches, '
+            f'the residual is {estimate.reprojection_error:.1f} px: with such a view '
+            f'{estimate.belief:.0%} of poses are right, needs {options.min_belief:.0%}',
+        ),
     )
     for failed, status, why in checks:
         if failed:
@@ -133,7 +152,7 @@ def judge_rival(
     """Rejects the best pose when another scene makes nearly as good a case for another one.
 
     Args:
-        best: The pose with the most inliers.
+        best: The most probable pose.
         rival: A pose from another scene.
         inlier_points: [K,3] positions of the inliers of the best pose, map frame.
         options: The thresholds.
@@ -142,13 +161,52 @@ def judge_rival(
     near = RIVAL_POSITION_SHARE * _median_distance(best, inlier_points)
     if apart.position <= near and apart.rotation_deg <= RIVAL_ROTATION_DEG:
         return None
-    if rival.inliers < max(options.min_inliers, options.max_rival_share * best.inliers):
+    if odds(best.belief) >= options.min_odds_against_rival * odds(rival.belief):
         return None
     return Verdict(
         Status.AMBIGUOUS,
-        f'{best.inliers} inliers speak for one pose, {rival.inliers} for another one '
-        f'{apart.position:.3g} and {apart.rotation_deg:.0f} deg away; the place may look like '
-        f'another one in the map',
+        f'{best.inliers} inliers speak for one pose and {rival.inliers} for another one '
+        f'{apart.position:.3g} and {apart.rotation_deg:.0f} deg away, which is nearly as probable; '
+        f'the place may look like another one in the map',
+    )
+
+
+def judge_focal_length(focal_length: FocalLength) -> Verdict | None:
+    """Rejects a pose whose image fits another focal length than the given one."""
+    off = abs(math.log(focal_length.ratio))
+    if off <= max(FOCAL_LENGTH_TOLERANCE, FOCAL_LENGTH_SIGMAS * focal_length.log_sigma):
+        return None
+    return Verdict(
+        Status.MISCALIBRATED,
+        f'the image fits {focal_length.ratio:.2f} times the given focal length better; is the '
+        f'calibration that of this camera, at this resolution and zoom?',
+    )
+
+
+def judge_tilt(tilt_deg: float, tolerance_deg: float) -> Verdict | None:
+    """Rejects a pose that leans against gravity."""
+    if tilt_deg <= tolerance_deg:
+        return None
+    return Verdict(
+        Status.IMPLAUSIBLE,
+        f'the pose is tilted by {tilt_deg:.1f} deg against gravity, allowed are '
+        f'{tolerance_deg:.1f} deg',
+    )
+
+
+def judge_mirrored(likeness: float, mirrored_likeness: float) -> Verdict | None:
+    """Rejects an image that is more like the map when mirrored.
+
+    Args:
+        likeness: Greatest product of its global descriptor and that of a reference image.
+        mirrored_likeness: The same for the mirrored image.
+    """
+    if mirrored_likeness - likeness <= MIRROR_MARGIN:
+        return None
+    return Verdict(
+        Status.IMPLAUSIBLE,
+        f'the image looks more like the map when it is mirrored ({mirrored_likeness:.2f} against '
+        f'{likeness:.2f}); does the driver flip it?',
     )
 
 

@@ -12,6 +12,11 @@ from typing import TYPE_CHECKING, Protocol
 
 from gam_relocalizer.cameras import camera_from_calibration
 from gam_relocalizer.errors import BagError, CameraError, ImageError, TransformError, UsageError
+from gam_relocalizer.localization.continuity import (
+    Continuity,
+    ContinuityOptions,
+    is_odometry_of,
+)
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import CovarianceOptions, robot_pose
 from gam_relocalizer.replay.bag import (
@@ -23,6 +28,7 @@ from gam_relocalizer.replay.bag import (
     open_bag,
 )
 from gam_relocalizer.replay.messages import (
+    ODOMETRY,
     POSE_TYPES,
     calibration_in,
     image_in,
@@ -41,13 +47,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from gam_relocalizer.cameras import CameraCalibration
+    from gam_relocalizer.localization.prior import Prior
     from gam_relocalizer.replay.bag import Bag, BagMessage, Topic
 
 TF = '/tf'
 TF_STATIC = '/tf_static'
 
-# A transform for the time of an image may be recorded a little after the image.
-TF_DELAY_NS = NANOSECONDS
+# A transform or odometry for the time of an image may be recorded a little after the image.
+DELAY_NS = NANOSECONDS
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,7 +62,9 @@ _LOG = logging.getLogger(__name__)
 class Localizes(Protocol):
     """What a replay needs of a localizer."""
 
-    def localize(self, image: NDArray[np.uint8], camera: pycolmap.Camera) -> LocalizationResult:
+    def localize(
+        self, image: NDArray[np.uint8], camera: pycolmap.Camera, prior: Prior | None = None
+    ) -> LocalizationResult:
         """Finds the camera's pose; always a result."""
 
 
@@ -71,9 +80,11 @@ class ReplayOptions:
         camera: The camera; without it the bag's CameraInfo tells.
         image_topic: Needed only when the bag has several.
         camera_info_topic: Needed only when it is not beside the image topic.
+        odometry_topic: Odometry of the body, to compare the fixes with.
         truth_topic: Poses of the body in the map frame to compare with.
         image_is_rectified: The images are rectified: use P of the CameraInfo, no distortion.
         covariance: Scales and floors of the covariance.
+        continuity: What is known about the robot and its map.
 
     Raises:
         UsageError: On construction: a period that is no time, or a map frame without a name.
@@ -86,9 +97,11 @@ class ReplayOptions:
     camera: pycolmap.Camera | None = None
     image_topic: str | None = None
     camera_info_topic: str | None = None
+    odometry_topic: str | None = None
     truth_topic: str | None = None
     image_is_rectified: bool = False
     covariance: CovarianceOptions = field(default_factory=CovarianceOptions)
+    continuity: ContinuityOptions = field(default_factory=ContinuityOptions)
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.period) and self.period >= 0.0):
@@ -116,18 +129,19 @@ def replay_bag(
     Raises:
         BagError: The bag is damaged, or a topic is missing.
     """
-    with open_bag(path) as bag, open_bag(path) as transform_bag:
+    with open_bag(path) as bag, open_bag(path) as motion_bag:
         topic = find_image_topic(bag, options.image_topic)
         facts = _read_facts(bag, topic, options)
-        transforms = _Transforms(transform_bag, facts.transforms)
+        continuity = Continuity(options.continuity)
+        motion = _Motion(motion_bag, facts.transforms, continuity, options)
         begin_ns, end_ns = bag.time_range
         throttle, illustrations = _Throttle(options.period), _Illustrations()
         attempts: list[Attempt] = []
         for message in bag.messages([topic.name]):
             if not throttle.is_due(message.stamp_ns):
                 continue
-            transforms.advance_to(message.log_ns + TF_DELAY_NS)
-            attempt = _attempt(message, localizer, options, facts, illustrations)
+            motion.advance_to(message.log_ns + DELAY_NS)
+            attempt = _attempt(message, localizer, options, facts, continuity, illustrations)
             attempts.append(attempt)
             progress(attempt, (message.log_ns - begin_ns) / (end_ns - begin_ns))
     return Replay(tuple(attempts), topic.name, topic.count, illustrations.chosen())
@@ -217,18 +231,39 @@ def _add_truth(truth: TransformTree, message: BagMessage, options: ReplayOptions
     truth.add(frame, _truth_frame(options), pose_in(message), message.stamp_ns, static=False)
 
 
-class _Transforms:
-    """Feeds a tree with the moving transforms of a bag, a little ahead of the images."""
+class _Motion:
+    """Takes in the moving transforms and the odometry of a bag, a little ahead of the images."""
 
-    def __init__(self, bag: Bag, tree: TransformTree) -> None:
-        self._messages = bag.messages([TF])
+    def __init__(
+        self, bag: Bag, tree: TransformTree, continuity: Continuity, options: ReplayOptions
+    ) -> None:
+        topics = [TF]
+        if options.odometry_topic:
+            topics.append(bag.require(options.odometry_topic, (ODOMETRY,), '--odom-topic').name)
+        self._messages = bag.messages(topics)
         self._tree = tree
+        self._continuity = continuity
+        self._base_frame = options.base_frame
         self._next = next(self._messages, None)
 
     def advance_to(self, log_ns: int) -> None:
         while self._next is not None and self._next.log_ns <= log_ns:
-            _add_transforms(self._tree, self._next, static=False)
+            self._take_in(self._next)
             self._next = next(self._messages, None)
+
+    def _take_in(self, message: BagMessage) -> None:
+        if message.topic.name == TF:
+            _add_transforms(self._tree, message, static=False)
+            return
+        child_frame = message.value.child_frame_id
+        if not is_odometry_of(child_frame, self._base_frame):
+            msg = (
+                f'{message.topic}: odometry of `{child_frame}`, the poses are those of '
+                f'`{self._base_frame}` (empty: the camera); they can be compared for one body '
+                f'only (--base-frame)'
+            )
+            raise BagError(msg)
+        self._continuity.add_odometry(message.stamp_ns, pose_in(message))
 
 
 def _add_transforms(tree: TransformTree, message: BagMessage, *, static: bool) -> None:
@@ -252,6 +287,7 @@ def _attempt(
     localizer: Localizes,
     options: ReplayOptions,
     facts: _Facts,
+    continuity: Continuity,
     illustrations: _Illustrations,
 ) -> Attempt:
     truth = facts.truth_at(message.stamp_ns, options)
@@ -264,12 +300,16 @@ def _attempt(
     except (ImageError, CameraError, TransformError) as err:
         refused = LocalizationResult(_STATUS_OF[type(err)], reason=str(err))
         return Attempt(message.stamp_ns, refused, truth=truth)
-    result = localizer.localize(image, camera)
+    prior = continuity.prior(message.stamp_ns, base_from_camera)
+    result = localizer.localize(image, camera, prior)
     if not result.accepted or result.estimate is None:
         return Attempt(message.stamp_ns, result, truth=truth)
-    illustrations.consider(Illustration(message.stamp_ns, image, camera, result.estimate))
     pose = robot_pose(result.estimate, base_from_camera, options.covariance)
-    return Attempt(message.stamp_ns, result, pose, truth)
+    judged = continuity.judge(message.stamp_ns, result, pose)
+    if not judged.accepted:
+        return Attempt(message.stamp_ns, judged, truth=truth)
+    illustrations.consider(Illustration(message.stamp_ns, image, camera, result.estimate))
+    return Attempt(message.stamp_ns, judged, pose, truth)
 
 
 _STATUS_OF: dict[type[Exception], Status] = {

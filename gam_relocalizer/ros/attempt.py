@@ -15,6 +15,7 @@ from gam_relocalizer.ros.conversions import pixels_from
 if TYPE_CHECKING:
     from gam_relocalizer.cameras import CameraCalibration
     from gam_relocalizer.localization.localizer import Localizer
+    from gam_relocalizer.localization.prior import Prior
     from gam_relocalizer.ros.schedule import StampedImage
 
 
@@ -27,12 +28,14 @@ class Attempt:
         image_topic: Resolved name of its topic.
         calibration: The newest calibration of its camera.
         image_is_rectified: Whether P holds for it, without distortion.
+        prior: What is known beforehand about where it was taken.
     """
 
     image: StampedImage
     image_topic: str
     calibration: CameraCalibration
     image_is_rectified: bool
+    prior: Prior
 
 
 def carry_out(attempt: Attempt, localizer: Localizer) -> LocalizationResult:
@@ -47,4 +50,4 @@ def carry_out(attempt: Attempt, localizer: Localizer) -> LocalizationResult:
         )
     except CameraError as err:
         return LocalizationResult(Status.NO_CALIBRATION, str(err))
-    return localizer.localize(pixels, camera)
+    return localizer.localize(pixels, camera, attempt.prior)

@@ -137,6 +137,7 @@ def status_message(result: LocalizationResult, header: Header, map_id: str) -> R
         keypoints=int(result.keypoints),
         matches=int(result.matches),
         inliers=int(result.inliers),
+        confidence=float(result.confidence),
         extraction_ms=float(timings.extraction),
         retrieval_ms=float(timings.retrieval),
         matching_ms=float(timings.matching),

@@ -160,7 +160,8 @@ class RelocalizerNode(LifecycleNode):
         else:
             log.warning(
                 f'the map is not metric ({manifest.frame.source}): its poses are in no frame '
-                f'`{self._settings.map_frame}` in the sense of REP-105 (metres, z up)'
+                f'`{self._settings.map_frame}` in the sense of REP-105 (metres, z up), and neither '
+                f'odom nor initialpose nor max_tilt_deg is used'
             )
 
     def _end_session(self) -> None:

@@ -14,6 +14,7 @@ from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 
 from gam_relocalizer.errors import UsageError
 from gam_relocalizer.geometry import rigid3d_from
+from gam_relocalizer.localization.continuity import ContinuityOptions
 from gam_relocalizer.localization.localizer import LocalizerOptions
 from gam_relocalizer.localization.robot_pose import CovarianceMode, CovarianceOptions
 from gam_relocalizer.localization.verdict import VerdictOptions
@@ -30,6 +31,7 @@ _SPECIFICATION = 'specification'
 _LOCALIZER = LocalizerOptions()
 _VERDICT = VerdictOptions()
 _COVARIANCE = CovarianceOptions()
+_CONTINUITY = ContinuityOptions()
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,11 @@ class NodeParameters:
         'Weights file of the matcher, such as one fine-tuned on the map; empty: the shipped one.',
         fixed=True,
     )
+    global_weights: str = _parameter(
+        '',
+        'Weights file of the global descriptor, for a map built with `--global netvlad`.',
+        fixed=True,
+    )
     min_inliers: int = _parameter(
         _VERDICT.min_inliers, 'Least number of inliers of a fix.', bounds=(4, 100_000)
     )
@@ -172,6 +179,18 @@ class NodeParameters:
         _VERDICT.max_rotation_std_deg,
         'Greatest standard deviation of the orientation [deg].',
         bounds=(1e-6, 180.0),
+    )
+    odometry_drift: float = _parameter(
+        _CONTINUITY.drift,
+        'Share of the way, and of the turns, that the odometry may be off; a fix that is further '
+        'off is held back until another one confirms it.',
+        bounds=(0.0, 1.0),
+    )
+    max_tilt_deg: float = _parameter(
+        _CONTINUITY.max_tilt_deg,
+        'Furthest that the base ever leans from upright [deg]: poses that lean further are wrong; '
+        '180: it may lean in any way.',
+        bounds=(0.0, 180.0),
     )
     position_covariance_scale: float = _parameter(
         _COVARIANCE.position_scale**2,
@@ -266,6 +285,7 @@ class NodeParameters:
             max_keypoints=self.max_keypoints,
             matcher=self.matcher,
             weights=self.path('weights') if self.weights else None,
+            global_weights=self.path('global_weights') if self.global_weights else None,
             verdict=VerdictOptions(
                 min_inliers=self.min_inliers,
                 min_inlier_ratio=self.min_inlier_ratio,
@@ -273,6 +293,16 @@ class NodeParameters:
                 max_relative_std=self.max_relative_std,
                 max_rotation_std_deg=self.max_rotation_std_deg,
             ),
+        )
+
+    def continuity_options(self, *, metric: bool) -> ContinuityOptions:
+        """What of them concerns odometry and the robot's motion.
+
+        Args:
+            metric: Whether the map is.
+        """
+        return ContinuityOptions(
+            metric=metric, drift=self.odometry_drift, max_tilt_deg=self.max_tilt_deg
         )
 
     def covariance_options(self) -> CovarianceOptions:

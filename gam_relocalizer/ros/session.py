@@ -13,6 +13,7 @@ from rclpy.duration import Duration
 from std_msgs.msg import Header
 
 from gam_relocalizer.errors import TransformError
+from gam_relocalizer.localization.continuity import Continuity
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import robot_pose
 from gam_relocalizer.replay.messages import calibration_of
@@ -20,6 +21,7 @@ from gam_relocalizer.ros.attempt import Attempt
 from gam_relocalizer.ros.conversions import nanoseconds_from, pixels_from, stamp_from
 from gam_relocalizer.ros.debug_image import draw_attempt
 from gam_relocalizer.ros.inputs import Inputs
+from gam_relocalizer.ros.prior_listener import PriorListener
 from gam_relocalizer.ros.schedule import Schedule, StampedImage
 from gam_relocalizer.ros.transform_listener import TransformListener
 
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
     from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
     from gam_relocalizer.cameras import CameraCalibration
+    from gam_relocalizer.localization.continuity import ContinuityOptions
+    from gam_relocalizer.localization.prior import Prior
     from gam_relocalizer.localization.robot_pose import RobotPose
     from gam_relocalizer.ros.outputs import Outputs
     from gam_relocalizer.ros.parameters import NodeParameters
@@ -37,6 +41,7 @@ if TYPE_CHECKING:
 SAY_FIX_EACH_S = 1.0
 SAY_REFUSAL_EACH_S = 5.0
 SAY_SILENCE_EACH_S = 10.0
+SAY_ODOMETRY_EACH_S = 10.0
 ANY_JUMP_BACK = JumpThreshold(
     min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
 )
@@ -63,6 +68,8 @@ class Session:
         self._waited_for_calibration = False
         self._transforms: TransformListener | None = None
         self._listen_to_transforms()
+        self._continuity = Continuity(self._continuity_options())
+        self._prior_listener = PriorListener(node, parameters, self._continuity)
         self._inputs = Inputs(node, parameters, self._on_image, self._on_camera_info)
         self._timer = node.create_timer(parameters.period, self._on_tick)
         self._jump_handle = node.get_clock().create_jump_callback(
@@ -75,6 +82,7 @@ class Session:
         self._jump_handle.unregister()
         self._node.destroy_timer(self._timer)
         self._inputs.destroy()
+        self._prior_listener.destroy()
         if self._transforms is not None:
             self._transforms.destroy()
 
@@ -84,6 +92,7 @@ class Session:
             self._timer.timer_period_ns = round(parameters.period * 1e9)
             self._timer.reset()
         self._parameters = parameters
+        self._continuity.options = self._continuity_options()
         self._listen_to_transforms()
 
     def on_worker_done(self) -> None:
@@ -92,6 +101,10 @@ class Session:
         if finished is not None:
             self._report(*finished)
         self._proceed()
+
+    def _continuity_options(self) -> ContinuityOptions:
+        metric = self._worker.scene_map.manifest.frame.metric
+        return self._parameters.continuity_options(metric=metric)
 
     def _listen_to_transforms(self) -> None:
         """Subscribes to the transforms if they are what tells the mount of the camera."""
@@ -146,6 +159,7 @@ class Session:
         self._log.warning(f'{why}: starting anew')
         self._worker.abandon()
         self._schedule.restart()
+        self._continuity.clear()
         self._outputs.forget_path()
         if self._transforms is not None:
             self._transforms.tree.clear_history()
@@ -179,33 +193,65 @@ class Session:
                 image_topic=self._inputs.image_topic,
                 calibration=self._calibration,
                 image_is_rectified=self._parameters.image_is_rectified,
+                prior=self._prior(image),
             )
         )
 
+    def _prior(self, image: StampedImage) -> Prior:
+        try:
+            base_from_camera = self._base_from_camera(image)
+        except TransformError:  # it may come while the attempt is under way
+            base_from_camera = None
+        return self._continuity.prior(image.stamp_ns, base_from_camera)
+
     def _report(self, attempt: Attempt, result: LocalizationResult) -> None:
-        self._publish(attempt, result)
+        result = self._publish(attempt.image, result)
         if self._outputs.debug_image_is_wanted and result.status is not Status.UNDECODABLE_IMAGE:
             pixels = pixels_from(attempt.image.message, attempt.image_topic)
             header = attempt.image.message.header
             self._outputs.publish_debug_image(header, draw_attempt(pixels, result))
 
-    def _publish(self, attempt: Attempt, result: LocalizationResult) -> None:
+    def _publish(self, image: StampedImage, result: LocalizationResult) -> LocalizationResult:
+        """Publishes a result, and hands it back as it was published."""
         if not result.accepted or result.estimate is None:
-            self._publish_refusal(attempt.image, result)
-            return
+            return self._publish_refusal(image, result)
         try:
-            base_from_camera = self._base_from_camera(attempt.image)
+            base_from_camera = self._base_from_camera(image)
         except TransformError as err:
             reason = f'{err}; publish the mount of the camera in TF or set `base_from_camera`'
-            self._publish_refusal(
-                attempt.image, replace(result, status=Status.NO_TRANSFORM, reason=reason)
+            return self._publish_refusal(
+                image, replace(result, status=Status.NO_TRANSFORM, reason=reason)
             )
-            return
         pose = robot_pose(result.estimate, base_from_camera, self._parameters.covariance_options())
-        header = self._header(attempt.image)
+        judged = self._judge(image, result, pose)
+        if not judged.accepted:
+            return self._publish_refusal(image, judged)
+        header = self._header(image)
         self._outputs.publish_fix(header, pose, result.estimate.camera_from_map)
-        self._outputs.publish_status(header, result, self._worker.map_id)
-        self._say_fix(pose, result)
+        self._outputs.publish_status(header, judged, self._worker.map_id)
+        self._say_fix(pose, judged)
+        return judged
+
+    def _judge(
+        self, image: StampedImage, result: LocalizationResult, pose: RobotPose
+    ) -> LocalizationResult:
+        """Holds back what odometry speaks against, and says so when odometry cannot be used."""
+        result = self._continuity.judge(image.stamp_ns, result, pose)
+        topic = self._prior_listener.odometry_topic
+        if self._continuity.misses_odometry(image.stamp_ns):
+            self._log.warning(
+                f'the odometry on {topic} has nothing for the stamps of the images: fixes are not '
+                f'compared with it; do their clocks agree?',
+                throttle_duration_sec=SAY_ODOMETRY_EACH_S,
+            )
+        if self._continuity.doubts_odometry:
+            self._log.warning(
+                f'several fixes in a row fit neither each other nor the last one by the odometry '
+                f'on {topic}: it is doubted, and fixes pass until two agree by it again; is it '
+                f'that of this robot, in metres, and do its wheels slip?',
+                throttle_duration_sec=SAY_ODOMETRY_EACH_S,
+            )
+        return result
 
     def _base_from_camera(self, image: StampedImage) -> pycolmap.Rigid3d:
         mount = self._parameters.mount()
@@ -224,12 +270,15 @@ class Session:
     def _refuse(self, image: StampedImage, status: Status, reason: str) -> None:
         self._publish_refusal(image, LocalizationResult(status, reason))
 
-    def _publish_refusal(self, image: StampedImage, result: LocalizationResult) -> None:
+    def _publish_refusal(
+        self, image: StampedImage, result: LocalizationResult
+    ) -> LocalizationResult:
         self._outputs.publish_status(self._header(image), result, self._worker.map_id)
         self._log.warning(
             f'no fix, {result.status.name}: {result.reason}',
             throttle_duration_sec=SAY_REFUSAL_EACH_S,
         )
+        return result
 
     def _say_fix(self, pose: RobotPose, result: LocalizationResult) -> None:
         x, y, z = pose.map_from_base.translation

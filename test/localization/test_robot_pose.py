@@ -17,7 +17,7 @@ from gam_relocalizer.geometry import (
     rigid3d_from_rotation,
     rotation_of,
 )
-from gam_relocalizer.localization.result import PoseEstimate
+from gam_relocalizer.localization.result import PoseEstimate, Support
 from gam_relocalizer.localization.robot_pose import (
     CovarianceMode,
     CovarianceOptions,
@@ -40,6 +40,8 @@ def make_estimate(camera_from_map: pycolmap.Rigid3d, covariance: np.ndarray) -> 
         inlier_ratio=1.0,
         coverage=1.0,
         reprojection_error=1.0,
+        support=Support(in_view=500, unmatched=0.1),
+        belief=0.95,
     )
 
 

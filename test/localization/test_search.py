@@ -16,7 +16,7 @@ from synthetic_place import NUM_IMAGES, Place, features_of, query_pose, ring_pos
 from gam_relocalizer.features.vlad import Vlad
 from gam_relocalizer.localization.localizer import LocalizerOptions
 from gam_relocalizer.localization.prior import PositionHint
-from gam_relocalizer.localization.result import LocalizationResult, PoseEstimate, Status
+from gam_relocalizer.localization.result import LocalizationResult, PoseEstimate, Status, Support
 from gam_relocalizer.localization.scenes import Coarse, Scene
 from gam_relocalizer.localization.search import Candidate, candidates, search
 
@@ -49,6 +49,8 @@ def result_with(inliers: int) -> LocalizationResult:
         inlier_ratio=1.0,
         coverage=1.0,
         reprojection_error=1.0,
+        support=Support(in_view=500, unmatched=0.1),
+        belief=0.95,
     )
     return LocalizationResult(Status.ACCEPTED if inliers else Status.NO_POSE, estimate=estimate)
 

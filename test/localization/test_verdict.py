@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from gam_relocalizer.geometry import rigid3d_from
 from gam_relocalizer.localization.pose import estimate_pose
-from gam_relocalizer.localization.result import PoseEstimate, Status
+from gam_relocalizer.localization.result import PoseEstimate, Status, Support
 from gam_relocalizer.localization.verdict import (
     VerdictOptions,
     coverage_of,
@@ -37,6 +37,8 @@ GOOD = PoseEstimate(
     inlier_ratio=0.3,
     coverage=0.5,
     reprojection_error=1.2,
+    support=Support(in_view=500, unmatched=0.1),
+    belief=0.95,
 )
 
 
@@ -169,5 +171,7 @@ def test_random_matches_are_never_accepted(count: int) -> None:
             inlier_ratio=float(np.mean(pose.inliers)),
             coverage=coverage_of(keypoints[pose.inliers], CAMERA),
             reprojection_error=1.0,
+            support=Support(in_view=500, unmatched=0.1),
+            belief=0.95,
         )
         assert judge(estimate, points[pose.inliers], 1.0, OPTIONS).status is not Status.ACCEPTED

@@ -18,6 +18,7 @@ from gam_relocalizer.localization.result import (
     LocalizationResult,
     PoseEstimate,
     Status,
+    Support,
     Timings,
 )
 from gam_relocalizer.scene_map import ExtractorIdentity, Manifest, MapFrame, SceneMap
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
     import pycolmap
     from numpy.typing import NDArray
+
+    from gam_relocalizer.localization.prior import Prior
 
 SECOND = 10**9
 START_NS = 1_700_000_000 * SECOND + 123_456_789
@@ -65,28 +68,31 @@ def grey_image(index: int) -> NDArray[np.uint8]:
 
 @dataclass
 class KnowingLocalizer:
-    """Reads the index of an image from its pixels and answers with the truth."""
+    """Reads the index of an image from its pixels and answers with the truth, but for mistakes."""
 
     points: NDArray[np.float64]
     refuse: Sequence[int] = ()
     seen: list[int] = field(default_factory=list)
     cameras: list[pycolmap.Camera] = field(default_factory=list)
+    priors: list[Prior | None] = field(default_factory=list)
+    mistaken: dict[int, int] = field(default_factory=dict)
 
-    def localize(self, image: NDArray[np.uint8], camera: pycolmap.Camera) -> LocalizationResult:
+    def localize(
+        self, image: NDArray[np.uint8], camera: pycolmap.Camera, prior: Prior | None = None
+    ) -> LocalizationResult:
         index = int(np.median(image))
         self.seen.append(index)
         self.cameras.append(camera)
+        self.priors.append(prior)
         timings = Timings(extraction=10.0, retrieval=1.0, matching=5.0 + index, pose=2.0)
         if index in self.refuse:
             reason = '3 inliers; needs 20 <inliers>'
             return LocalizationResult(Status.TOO_FEW_INLIERS, reason, timings=timings)
-        estimate = estimate_at(index, camera, self.points)
+        estimate = estimate_at(self.mistaken.get(index, index), camera, self.points)
         return LocalizationResult(Status.ACCEPTED, 'good', estimate, timings=timings)
 
 
-def estimate_at(
-    index: int, camera: pycolmap.Camera, points: NDArray[np.float64]
-) -> PoseEstimate:
+def estimate_at(index: int, camera: pycolmap.Camera, points: NDArray[np.float64]) -> PoseEstimate:
     camera_from_map = camera_from_map_at(index)
     in_camera = points @ camera_from_map.rotation.matrix().T + camera_from_map.translation
     pixels = np.asarray(camera.img_from_cam(in_camera)).reshape(-1, 2)
@@ -101,6 +107,8 @@ def estimate_at(
         inlier_ratio=0.5,
         coverage=0.6,
         reprojection_error=0.4,
+        support=Support(in_view=500, unmatched=0.1),
+        belief=0.95,
     )
 
 
@@ -108,9 +116,9 @@ def wall_map_at(path: Path) -> SceneMap:
     """Points on the walls of a room, seen by cameras along the drive."""
     random = np.random.default_rng(3)
     around = random.uniform(-np.pi, np.pi, 2000)
-    points = np.column_stack([
-        5.0 * np.cos(around), 5.0 * np.sin(around), random.uniform(0.0, 2.5, len(around))
-    ])
+    points = np.column_stack(
+        [5.0 * np.cos(around), 5.0 * np.sin(around), random.uniform(0.0, 2.5, len(around))]
+    )
     references = range(0, 100, 20)
     return SceneMap(
         path=path,
@@ -200,20 +208,25 @@ class BagWriter:
         )  # fmt: skip
         self.write(topic, 'tf2_msgs/msg/TFMessage', stamp_ns, transforms=[stamped])
 
+    def odometry(self, index: int, child_frame: str = 'base_link') -> None:
+        """Odometry without drift, from a frame that lies elsewhere."""
+        odom_from_map = rigid3d_from_rotation(Rotation.from_euler('z', 1.0), [7.0, -3.0, 0.0])
+        odom_from_base = odom_from_map * map_from_base_at(index)
+        fields = odometry_fields(pose(odom_from_base), child_frame)
+        head = header(stamp_of(index), 'odom')
+        self.write('/odom', 'nav_msgs/msg/Odometry', stamp_of(index), header=head, **fields)
+
     def truth(
         self, index: int, frame: str = 'map', msgtype: str = 'geometry_msgs/msg/PoseStamped'
     ) -> None:
-        fields: dict[str, Any] = {
-            'header': header(stamp_of(index), frame), 'pose': pose(map_from_base_at(index))
-        }  # fmt: skip
-        if msgtype != 'geometry_msgs/msg/PoseStamped':
-            fields['pose'] = with_covariance('geometry_msgs/msg/PoseWithCovariance', fields['pose'])
+        true_pose = pose(map_from_base_at(index))
+        fields: dict[str, Any] = {'pose': true_pose}
+        if msgtype == 'geometry_msgs/msg/PoseWithCovarianceStamped':
+            fields['pose'] = with_covariance('geometry_msgs/msg/PoseWithCovariance', true_pose)
         if msgtype == 'nav_msgs/msg/Odometry':
-            zero = vector('geometry_msgs/msg/Vector3', np.zeros(3))
-            twist = new('geometry_msgs/msg/Twist', linear=zero, angular=zero)
-            fields['twist'] = with_covariance('geometry_msgs/msg/TwistWithCovariance', twist)
-            fields['child_frame_id'] = 'base_link'
-        self.write('/ground_truth', msgtype, stamp_of(index), **fields)
+            fields = odometry_fields(true_pose, 'base_link')
+        head = header(stamp_of(index), frame)
+        self.write('/ground_truth', msgtype, stamp_of(index), header=head, **fields)
 
 
 def new(msgtype: str, **fields: Any) -> Any:  # noqa: ANN401
@@ -234,6 +247,16 @@ def vector(msgtype: str, values: NDArray[np.float64]) -> Any:  # noqa: ANN401
 def quaternion(transform: pycolmap.Rigid3d) -> Any:  # noqa: ANN401
     w, x, y, z = (float(value) for value in quaternion_wxyz(transform))
     return new('geometry_msgs/msg/Quaternion', x=x, y=y, z=z, w=w)
+
+
+def odometry_fields(body_pose: Any, child_frame: str) -> dict[str, Any]:  # noqa: ANN401
+    zero = vector('geometry_msgs/msg/Vector3', np.zeros(3))
+    twist = new('geometry_msgs/msg/Twist', linear=zero, angular=zero)
+    return {
+        'pose': with_covariance('geometry_msgs/msg/PoseWithCovariance', body_pose),
+        'twist': with_covariance('geometry_msgs/msg/TwistWithCovariance', twist),
+        'child_frame_id': child_frame,
+    }
 
 
 def with_covariance(msgtype: str, value: Any) -> Any:  # noqa: ANN401
@@ -267,3 +290,10 @@ def fill_drive(bag: BagWriter, images: int = 100) -> None:
         bag.truth(index)
         if index == 5:
             bag.transform('base_link', 'camera_optical', BASE_FROM_CAMERA, stamp_of(index))
+
+
+def fill_with_odometry(bag: BagWriter) -> None:
+    """The same drive, with odometry."""
+    for index in range(100):
+        bag.odometry(index)
+    fill_drive(bag)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import typer
-from recorded_drive import KnowingLocalizer, write_bag
+from recorded_drive import KnowingLocalizer, fill_with_odometry, write_bag
 from typer.testing import CliRunner
 
 from gam_relocalizer.cli.replay import replay
@@ -58,6 +58,18 @@ def test_writes_all_files_and_succeeds_with_refused_attempts(
     assert 'TOO_FEW_INLIERS' in result.output
 
 
+def test_fixes_that_odometry_speaks_against_are_told_as_implausible(
+    knowing_localizer: KnowingLocalizer, tmp_path: Path
+) -> None:
+    knowing_localizer.mistaken = {50: 99}
+    bag, out = write_bag(tmp_path / 'bag', fill_with_odometry), tmp_path / 'out'
+    result = run(bag, '--map', 'wall', '--out', out, '--period', 1.0, '--odom-topic', '/odom')
+    assert result.exit_code == 0, result.output
+    summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
+    assert summary['odometry_topic'] == '/odom'
+    assert summary['statuses'] == {'ACCEPTED': 8, 'TOO_FEW_INLIERS': 1, 'IMPLAUSIBLE': 1}
+
+
 def test_drive_through_a_rendered_room_is_found_twice_alike(
     tiny_place: TinyPlace, tmp_path: Path
 ) -> None:
@@ -94,6 +106,7 @@ def test_matcher_is_the_one_named(tiny_place: TinyPlace, tmp_path: Path) -> None
         (['--matcher', 'best'], UsageError),
         (['--matcher', 'nn-cross', '--weights', 'tuned.npz'], UsageError),
         (['--weights', 'nowhere.npz'], WeightsError),
+        (['--global-weights', 'netvlad.mat'], UsageError),
     ],
 )
 def test_matcher_that_cannot_be_had_is_a_failure_that_leaves_nothing(

@@ -16,6 +16,7 @@ from recorded_drive import (
     KnowingLocalizer,
     camera_from_map_at,
     fill_drive,
+    fill_with_odometry,
     map_from_base_at,
     stamp_of,
     write_bag,
@@ -46,7 +47,10 @@ def assert_same_pose(found: pycolmap.Rigid3d, truth: pycolmap.Rigid3d) -> None:
 
 
 def replay_of(
-    path: Path, fill: Any, localizer: KnowingLocalizer, options: ReplayOptions = MOUNTED  # noqa: ANN401
+    path: Path,
+    fill: Any,
+    localizer: KnowingLocalizer,
+    options: ReplayOptions = MOUNTED,  # noqa: ANN401
 ) -> Replay:
     return replay_bag(write_bag(path / 'bag', fill), localizer, options)
 
@@ -279,6 +283,54 @@ def test_truth_may_be_of_any_pose_type(
     (attempt,) = replay_of(tmp_path, fill, localizer, options).attempts
     assert attempt.truth is not None
     assert_same_pose(attempt.truth, map_from_base_at(3))
+
+
+def test_a_fix_that_odometry_speaks_against_is_held_back(
+    tmp_path: Path, localizer: KnowingLocalizer
+) -> None:
+    localizer.mistaken = {30: 99}
+    options = ReplayOptions(period=1.0, odometry_topic='/odom')
+    attempts = replay_of(tmp_path, fill_with_odometry, localizer, options).attempts
+    for index, attempt in zip(range(0, 100, 10), attempts, strict=True):
+        held = index == 30
+        assert attempt.result.status is (Status.IMPLAUSIBLE if held else Status.ACCEPTED)
+        assert (attempt.robot_pose is None) == held
+
+
+def test_without_the_topic_odometry_has_no_say(tmp_path: Path, localizer: KnowingLocalizer) -> None:
+    localizer.mistaken = {30: 99}
+    replay = replay_of(tmp_path, fill_with_odometry, localizer, ReplayOptions(period=1.0))
+    assert all(attempt.result.accepted for attempt in replay.attempts)
+
+
+def test_odometry_tells_the_localizer_where_to_look_first(
+    tmp_path: Path, localizer: KnowingLocalizer
+) -> None:
+    options = ReplayOptions(period=3.0, odometry_topic='/odom')
+    replay_of(tmp_path, fill_with_odometry, localizer, options)
+    assert localizer.priors[0] is not None
+    assert localizer.priors[0].hint is None
+    for index, prior in zip(localizer.seen[1:], localizer.priors[1:], strict=True):
+        assert prior is not None
+        assert prior.hint is not None
+        map_from_camera = camera_from_map_at(index).inverse()
+        np.testing.assert_allclose(prior.hint.position, map_from_camera.translation, atol=1e-6)
+
+
+def test_odometry_of_another_body_is_refused(tmp_path: Path, localizer: KnowingLocalizer) -> None:
+    def fill(bag: BagWriter) -> None:
+        bag.odometry(0, child_frame='trailer')
+        fill_drive(bag, images=8)
+
+    with pytest.raises(BagError, match='trailer'):
+        replay_of(tmp_path, fill, localizer, ReplayOptions(odometry_topic='/odom'))
+
+
+def test_a_topic_that_holds_no_odometry_is_refused(
+    mcap_drive: Path, localizer: KnowingLocalizer
+) -> None:
+    with pytest.raises(BagError, match=r'--odom-topic.*nav_msgs/msg/Odometry'):
+        replay_bag(mcap_drive, localizer, ReplayOptions(odometry_topic='/ground_truth'))
 
 
 @pytest.mark.parametrize('period', [-1.0, float('nan'), float('inf')])

@@ -21,6 +21,7 @@ from gam_relocalizer.localization.result import (
     LocalizationResult,
     PoseEstimate,
     Status,
+    Support,
     Timings,
 )
 from gam_relocalizer.localization.robot_pose import RobotPose
@@ -126,9 +127,7 @@ def test_a_pose_survives_the_wire() -> None:
     assert abs(np.linalg.norm(quaternion) - 1.0) < 1e-12
     again = rigid3d_from(quaternion, (position.x, position.y, position.z))
     np.testing.assert_allclose(again.matrix(), pose.map_from_base.matrix(), atol=1e-15)
-    np.testing.assert_array_equal(
-        np.array(received.pose.covariance).reshape(6, 6), pose.covariance
-    )
+    np.testing.assert_array_equal(np.array(received.pose.covariance).reshape(6, 6), pose.covariance)
     assert received.header == HEADER
 
 
@@ -149,6 +148,8 @@ def test_a_status_survives_the_wire() -> None:
         inlier_ratio=np.float64(0.5),
         coverage=np.float32(0.25),
         reprojection_error=1.5,
+        support=Support(in_view=500, unmatched=0.1),
+        belief=0.95,
     )
     result = LocalizationResult(
         Status.LOW_INLIER_RATIO,

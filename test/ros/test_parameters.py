@@ -13,6 +13,7 @@ import yaml
 from rclpy.parameter import Parameter
 
 from gam_relocalizer.errors import UsageError
+from gam_relocalizer.localization.continuity import ContinuityOptions
 from gam_relocalizer.localization.localizer import LocalizerOptions
 from gam_relocalizer.localization.robot_pose import CovarianceMode, CovarianceOptions
 from gam_relocalizer.ros.node import RelocalizerNode
@@ -40,6 +41,7 @@ def node(ros: None) -> Iterator[RelocalizerNode]:  # noqa: ARG001 - ROS must be 
 def test_defaults_are_those_of_the_localizer() -> None:
     assert NodeParameters().localizer_options() == LocalizerOptions()
     assert NodeParameters().covariance_options() == CovarianceOptions()
+    assert NodeParameters().continuity_options(metric=True) == ContinuityOptions()
 
 
 def test_thresholds_and_covariance_reach_the_core() -> None:
@@ -53,6 +55,12 @@ def test_thresholds_and_covariance_reach_the_core() -> None:
     assert parameters.covariance_options().mode is CovarianceMode.DIAGONAL
 
 
+def test_what_is_known_about_the_robot_reaches_the_core() -> None:
+    parameters = NodeParameters(odometry_drift=0.2, max_tilt_deg=15.0)
+    expected = ContinuityOptions(metric=False, drift=0.2, max_tilt_deg=15.0)
+    assert parameters.continuity_options(metric=False) == expected
+
+
 def test_the_matcher_and_its_weights_reach_the_core() -> None:
     options = NodeParameters(matcher='bmnet', weights='~/tuned/bmnet.npz').localizer_options()
     assert options.matcher == 'bmnet'
@@ -60,7 +68,13 @@ def test_the_matcher_and_its_weights_reach_the_core() -> None:
     assert NodeParameters(weights='').localizer_options().weights is None
 
 
-@pytest.mark.parametrize('name', ['map', 'weights'])
+def test_the_weights_of_the_global_descriptor_reach_the_core() -> None:
+    options = NodeParameters(global_weights='~/netvlad.mat').localizer_options()
+    assert options.global_weights == Path.home() / 'netvlad.mat'
+    assert NodeParameters(global_weights='').localizer_options().global_weights is None
+
+
+@pytest.mark.parametrize('name', ['map', 'weights', 'global_weights'])
 def test_an_unknown_home_folder_is_refused(name: str) -> None:
     with pytest.raises(UsageError, match=name):
         NodeParameters(**{name: '~nobody-of-this-name/file'}).path(name)

@@ -11,6 +11,7 @@ from sensor_msgs.msg import Image
 
 from gam_relocalizer.cameras import CameraCalibration
 from gam_relocalizer.localization.localizer import LocalizerOptions
+from gam_relocalizer.localization.prior import Prior
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.ros.attempt import Attempt
 from gam_relocalizer.ros.schedule import StampedImage
@@ -37,7 +38,7 @@ class GatedLocalizer:
     def with_options(self, options: LocalizerOptions) -> GatedLocalizer:
         return GatedLocalizer(self.gate, options)
 
-    def localize(self, image: Any, camera: Any) -> LocalizationResult:  # noqa: ANN401, ARG002
+    def localize(self, image: Any, *_unused: object) -> LocalizationResult:  # noqa: ANN401
         assert self.gate.wait(LIMIT_S)
         if image.max() == 255:
             msg = 'a defect'
@@ -47,7 +48,9 @@ class GatedLocalizer:
 
 def attempt(brightness: int = 0) -> Attempt:
     image = Image(height=1, width=2, encoding='mono8', step=2, data=bytes([brightness] * 2))
-    return Attempt(StampedImage(image, 7), '/image', CALIBRATION, image_is_rectified=False)
+    return Attempt(
+        StampedImage(image, 7), '/image', CALIBRATION, image_is_rectified=False, prior=Prior()
+    )
 
 
 class Bench:

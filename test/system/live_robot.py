@@ -194,9 +194,7 @@ class Robot:
 
     def wait_for_first_fix(self, pixels: NDArray[np.uint8], stamps: Iterator[float]) -> None:
         """Until the node has heard mount and calibration, which come by topics of their own."""
-        wait_for(
-            lambda: self.ask(image_message(pixels, next(stamps))).accepted, 'the first fix'
-        )
+        wait_for(lambda: self.ask(image_message(pixels, next(stamps))).accepted, 'the first fix')
 
     def verdict_on(self, image: Image | CompressedImage) -> RelocalizationStatus | None:
         return _of_stamp(self.heard.statuses, image.header.stamp)

@@ -1,0 +1,116 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+"""Feeds what is known beside the images: odometry, and where somebody says that the robot is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from gam_relocalizer.localization.continuity import is_odometry_of
+from gam_relocalizer.localization.robot_pose import RobotPose
+from gam_relocalizer.replay.messages import rigid_in
+from gam_relocalizer.ros.conversions import nanoseconds_from
+from gam_relocalizer.ros.inputs import incompatible_qos
+
+if TYPE_CHECKING:
+    from rclpy.node import Node
+
+    from gam_relocalizer.localization.continuity import Continuity
+    from gam_relocalizer.ros.parameters import NodeParameters
+
+# SensorDataQoS, with room for what a quick odometry sends while this thread has no turn.
+ODOMETRY_QOS = QoSProfile(
+    depth=50, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
+)
+INITIAL_POSE_QOS = QoSProfile(
+    depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
+)
+SAY_EACH_S = 10.0
+SAY_INITIAL_POSE_EACH_S = 1.0
+
+
+class PriorListener:
+    """Subscribes to `odom` and `initialpose`."""
+
+    def __init__(self, node: Node, parameters: NodeParameters, continuity: Continuity) -> None:
+        self._node = node
+        self._log = node.get_logger()
+        self._map_frame = parameters.map_frame
+        self._base_frame = parameters.base_frame
+        self._continuity = continuity
+        self._odometry = node.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
+        topic = node.resolve_topic_name('initialpose')
+        cure = 'publish it reliably'
+        self._initial_pose = node.create_subscription(
+            PoseWithCovarianceStamped,
+            topic,
+            self._on_initial_pose,
+            INITIAL_POSE_QOS,
+            event_callbacks=incompatible_qos(node, topic, cure),
+        )
+
+    @property
+    def odometry_topic(self) -> str:
+        """Resolved name of the topic of the odometry."""
+        name: str = self._odometry.topic_name
+        return name
+
+    def destroy(self) -> None:
+        """Ends the subscriptions."""
+        self._node.destroy_subscription(self._odometry)
+        self._node.destroy_subscription(self._initial_pose)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        if not is_odometry_of(message.child_frame_id, self._base_frame):
+            self._say_other_body(message.child_frame_id)
+            return
+        try:
+            odom_from_base = rigid_in(message.pose.pose.position, message.pose.pose.orientation)
+        except ValueError as err:
+            self._log.warning(
+                f'ignored from {self.odometry_topic}: a pose that is none: {err}',
+                throttle_duration_sec=SAY_EACH_S,
+            )
+            return
+        self._continuity.add_odometry(nanoseconds_from(message.header.stamp), odom_from_base)
+
+    def _say_other_body(self, child_frame: str) -> None:
+        body = f'`{self._base_frame}`' if self._base_frame else 'the camera'
+        self._log.warning(
+            f'the odometry on {self.odometry_topic} is that of `{child_frame}`, the poses are '
+            f'those of {body}: it is not used; set `base_frame` to `{child_frame}`, or remap '
+            f'`odom` to odometry of {body}',
+            once=True,
+        )
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        topic, frame = self._initial_pose.topic_name, message.header.frame_id.strip('/')
+        if frame != self._map_frame.strip('/'):
+            self._log.warning(
+                f'ignored from {topic}: a pose in frame `{frame}`; expected one in '
+                f'`{self._map_frame}` (in RViz: the fixed frame)'
+            )
+            return
+        covariance = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+        try:
+            map_from_base = rigid_in(message.pose.pose.position, message.pose.pose.orientation)
+        except ValueError as err:
+            self._log.warning(f'ignored from {topic}: a pose that is none: {err}')
+            return
+        if not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
+            self._log.warning(
+                f'ignored from {topic}: a covariance with negative variances, or numbers that '
+                f'are not finite'
+            )
+            return
+        self._continuity.suggest(RobotPose(map_from_base, covariance))
+        x, y, z = map_from_base.translation
+        self._log.info(
+            f'looking around {x:.3f} {y:.3f} {z:.3f} first, from {topic}',
+            throttle_duration_sec=SAY_INITIAL_POSE_EACH_S,
+        )
