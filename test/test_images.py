@@ -173,9 +173,7 @@ def test_known_encodings_are_all_tested_here() -> None:
 
 def test_rgb8_without_padding_is_not_copied() -> None:
     stored = np.arange(36, dtype=np.uint8)
-    image = decode_image(
-        'rgb8', 4, 3, 12, is_bigendian=False, data=stored, source='/camera/image'
-    )
+    image = decode_image('rgb8', 4, 3, 12, is_bigendian=False, data=stored, source='/camera/image')
     assert np.shares_memory(image, stored)
 
 
@@ -204,8 +202,13 @@ def test_truncated_image_names_topic_and_bytes(
     found = choice.draw(st.integers(0, needed - 1))
     with pytest.raises(ImageError, match=rf'/camera/image.* {needed} bytes, found {found}$'):
         decode_image(
-            encoding, width, height, step,
-            is_bigendian=False, data=bytes(found), source='/camera/image',
+            encoding,
+            width,
+            height,
+            step,
+            is_bigendian=False,
+            data=bytes(found),
+            source='/camera/image',
         )
 
 
@@ -225,8 +228,13 @@ def test_truncated_image_names_topic_and_bytes(
 def test_refuses_impossible_sizes(encoding: str, width: int, height: int, step: int) -> None:
     with pytest.raises(ImageError):
         decode_image(
-            encoding, width, height, step,
-            is_bigendian=False, data=bytes(64), source='/camera/image',
+            encoding,
+            width,
+            height,
+            step,
+            is_bigendian=False,
+            data=bytes(64),
+            source='/camera/image',
         )
 
 

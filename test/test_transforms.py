@@ -70,9 +70,7 @@ def test_moving_frames_are_interpolated() -> None:
     tree = TransformTree()
     tree.add('base', 'head', yaw(0.0, (0.0, 0.0, 1.0)), 1 * SECOND, static=False)
     tree.add('base', 'head', yaw(1.0, (4.0, 0.0, 1.0)), 2 * SECOND, static=False)
-    assert_same(
-        tree.lookup('base', 'head', int(1.25 * SECOND)), yaw(0.25, (1.0, 0.0, 1.0))
-    )
+    assert_same(tree.lookup('base', 'head', int(1.25 * SECOND)), yaw(0.25, (1.0, 0.0, 1.0)))
 
 
 @given(

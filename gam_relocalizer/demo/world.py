@@ -113,7 +113,7 @@ MAPPING_ROUTE = (
 )  # fmt: skip
 
 
-class _Builder:
+class Builder:
     """Collects quads and textures; lengths in metres, in the map frame."""
 
     def __init__(self) -> None:
@@ -186,7 +186,7 @@ def demo_world(seed: int = 0, *, rearranged: bool = False) -> World:
     Raises:
         UsageError: The package with the photographs is not installed.
     """
-    builder, rng = _Builder(), np.random.default_rng(seed)
+    builder, rng = Builder(), np.random.default_rng(seed)
     loose = np.random.default_rng((seed, int(rearranged)))
     for room in ROOMS:
         _add_shell(builder, room, rng)
@@ -202,7 +202,7 @@ def demo_world(seed: int = 0, *, rearranged: bool = False) -> World:
         for room in ROOMS
         for x in np.arange(room.x[0] + 1.7, room.x[1] - 1.0, 3.4)
     ]
-    _add_lamp_panels(builder, lamps)
+    add_lamp_panels(builder, lamps)
     return World(
         tuple(builder.quads),
         tuple(builder.textures),
@@ -218,19 +218,19 @@ def tiny_world(seed: int = 0) -> World:
     Raises:
         UsageError: The package with the photographs is not installed.
     """
-    builder, rng = _Builder(), np.random.default_rng(seed)
+    builder, rng = Builder(), np.random.default_rng(seed)
     room = Room((0.0, 4.0), (0.0, 3.0), ('stucco_1', 1.6), ('wood_planks_1', 1.5))
     _add_shell(builder, room, rng)
     prints = _Prints(builder, rng)
     for along in (0.7, 2.0, 3.3):
-        _hang(builder, prints.next_painting(), room, 'north', along, (0.8, 0.8))
-        _hang(builder, prints.next_painting(), room, 'south', along, (0.8, 0.8))
-    _hang(builder, prints.boards[0], room, 'east', 1.5, (1.8, 1.2))
-    _hang(builder, prints.boards[1], room, 'west', 1.5, (1.8, 1.2))
+        hang(builder, prints.next_painting(), room, 'north', along, (0.8, 0.8))
+        hang(builder, prints.next_painting(), room, 'south', along, (0.8, 0.8))
+    hang(builder, prints.boards[0], room, 'east', 1.5, (1.8, 1.2))
+    hang(builder, prints.boards[1], room, 'west', 1.5, (1.8, 1.2))
     for x, y in ((0.3, 0.3), (3.7, 0.3), (3.7, 2.7), (0.3, 2.7)):
         _stack_cartons(builder, prints, rng, (x, y, 0.0), 3)
     lamp = (2.0, 1.5, ROOM_HEIGHT - 0.15)
-    _add_lamp_panels(builder, [lamp])
+    add_lamp_panels(builder, [lamp])
     loop = ((1.0, 1.1), (2.0, 0.9), (3.0, 1.1), (3.1, 1.6), (2.4, 2.0), (1.4, 2.0))
     return World(
         tuple(builder.quads),
@@ -244,7 +244,7 @@ def tiny_world(seed: int = 0) -> World:
 class _Prints:
     """Textures that furniture and walls share; the same print may hang in several places."""
 
-    def __init__(self, builder: _Builder, rng: np.random.Generator) -> None:
+    def __init__(self, builder: Builder, rng: np.random.Generator) -> None:
         photo = textures.photo
         portraits = [textures.photo(name) for name in textures.portrait_names()]
         order = rng.permutation(len(portraits))
@@ -308,7 +308,7 @@ class _Prints:
         return self.paintings[(self._next - 1) % len(self.paintings)]
 
 
-def _add_shell(builder: _Builder, room: Room, rng: np.random.Generator) -> None:
+def _add_shell(builder: Builder, room: Room, rng: np.random.Generator) -> None:
     """Walls with openings, floor and ceiling of a room."""
     (west, east), (south, north) = room.x, room.y
     walls = (
@@ -341,7 +341,7 @@ def _surface(
 
 
 def _add_wall(
-    builder: _Builder,
+    builder: Builder,
     start: NDArray[np.float64],
     end: NDArray[np.float64],
     material: tuple[str, float],
@@ -387,7 +387,7 @@ def _openings(
     return sorted(found)
 
 
-def _add_doorway(builder: _Builder, doorway: Doorway, rng: np.random.Generator) -> None:
+def _add_doorway(builder: Builder, doorway: Doorway, rng: np.random.Generator) -> None:
     """Threshold, jambs and lintel; wooden, standing out of the wall a little."""
     wood = textures.weathered(textures.resized(textures.photo('wood_1'), 60, 440), rng, 0.2)
     texture = builder.texture(wood)
@@ -409,7 +409,7 @@ def _add_doorway(builder: _Builder, doorway: Doorway, rng: np.random.Generator) 
     builder.box((*centre, 0.0), (x1 - x0, y1 - y0, 0.012), faces)
 
 
-def _add_lamp_panels(builder: _Builder, lamps: Sequence[tuple[float, float, float]]) -> None:
+def add_lamp_panels(builder: Builder, lamps: Sequence[tuple[float, float, float]]) -> None:
     """Bright panels under the ceiling at every lamp."""
     panel = np.full((48, 48, 3), 245, np.uint8)
     panel[::12] = panel[:, ::12] = 205
@@ -420,8 +420,8 @@ def _add_lamp_panels(builder: _Builder, lamps: Sequence[tuple[float, float, floa
         builder.quad((x + 0.9, y - 0.2, ROOM_HEIGHT - 0.02), (0.4, 0, 0), (0, 0.4, 0), grate)
 
 
-def _hang(
-    builder: _Builder,
+def hang(
+    builder: Builder,
     texture: int,
     room: Room,
     side: str,
@@ -455,7 +455,7 @@ def _hang(
 
 
 def _gallery_wall(
-    builder: _Builder,
+    builder: Builder,
     prints: _Prints,
     room: Room,
     side: str,
@@ -465,15 +465,15 @@ def _gallery_wall(
     for index, along in enumerate(places):
         if index % 3 == 1:
             for height in (1.05, 1.75):
-                _hang(builder, prints.next_painting(), room, side, along, (0.55, 0.55), height)
+                hang(builder, prints.next_painting(), room, side, along, (0.55, 0.55), height)
         else:
             side_length = 0.75 if index % 3 == 0 else 0.95
             size = (side_length, side_length)
-            _hang(builder, prints.next_painting(), room, side, along, size, 1.45)
+            hang(builder, prints.next_painting(), room, side, along, size, 1.45)
 
 
 def _table(
-    builder: _Builder, prints: _Prints, centre: tuple[float, float], size: tuple[float, float]
+    builder: Builder, prints: _Prints, centre: tuple[float, float], size: tuple[float, float]
 ) -> None:
     """A table 0.74 m high on two panels."""
     x, y = centre
@@ -484,7 +484,7 @@ def _table(
         builder.box((x + sign * (size[0] / 2 - 0.06), y, 0.35), (0.04, size[1] - 0.1, 0.7), faces)
 
 
-def _chair(builder: _Builder, prints: _Prints, place: tuple[float, float], heading: float) -> None:
+def _chair(builder: Builder, prints: _Prints, place: tuple[float, float], heading: float) -> None:
     """One of many identical chairs; `heading` [rad] is where the one who sits looks."""
     turn = Rotation.from_euler('z', heading)
     wood, back = prints.materials['wood_planks_1'], prints.materials['metal_grill_1']
@@ -499,7 +499,7 @@ def _chair(builder: _Builder, prints: _Prints, place: tuple[float, float], headi
 
 
 def _bookshelf(
-    builder: _Builder, prints: _Prints, centre: tuple[float, float], degrees: float, first: int
+    builder: Builder, prints: _Prints, centre: tuple[float, float], degrees: float, first: int
 ) -> None:
     """A shelf 1.2 m wide and 1.9 m high, five rows of books; its back is at its -x side."""
     turn = Rotation.from_euler('z', degrees, degrees=True)
@@ -522,7 +522,7 @@ def _bookshelf(
 
 
 def _stack_cartons(
-    builder: _Builder,
+    builder: Builder,
     prints: _Prints,
     rng: np.random.Generator,
     foot: tuple[float, float, float],
@@ -543,7 +543,7 @@ def _stack_cartons(
 
 
 def _clutter(
-    builder: _Builder,
+    builder: Builder,
     prints: _Prints,
     rng: np.random.Generator,
     area: tuple[float, float, float, float, float],
@@ -570,24 +570,24 @@ def _clutter(
 
 
 def _lay(
-    builder: _Builder, texture: int, centre: tuple[float, float, float], size: tuple[float, float]
+    builder: Builder, texture: int, centre: tuple[float, float, float], size: tuple[float, float]
 ) -> None:
     """Lays a sheet or a rug flat on a surface."""
     x, y, z = centre
     builder.quad((x - size[0] / 2, y + size[1] / 2, z), (size[0], 0, 0), (0, -size[1], 0), texture)
 
 
-def _furnish_office(builder: _Builder, prints: _Prints, loose: np.random.Generator) -> None:
+def _furnish_office(builder: Builder, prints: _Prints, loose: np.random.Generator) -> None:
     room = OFFICE
     _gallery_wall(builder, prints, room, 'west', (6.1, 7.2, 8.3))
-    _hang(builder, prints.window, room, 'north', 1.5, (1.7, 1.25), 1.55)
-    _hang(builder, prints.boards[0], room, 'north', 3.5, (1.6, 1.05), 1.5)
-    _hang(builder, prints.window, room, 'north', 5.5, (1.7, 1.25), 1.55)
-    _hang(builder, prints.posters[0], room, 'east', 6.2, (0.62, 0.9))
-    _hang(builder, prints.paintings[0], room, 'east', 8.4, (0.7, 0.7))
-    _hang(builder, prints.boards[1], room, 'south', 3.6, (1.4, 0.95), 1.45)
-    _hang(builder, prints.posters[1], room, 'south', 0.8, (0.66, 0.96))
-    _hang(builder, prints.posters[2], room, 'south', 6.35, (0.66, 0.96))
+    hang(builder, prints.window, room, 'north', 1.5, (1.7, 1.25), 1.55)
+    hang(builder, prints.boards[0], room, 'north', 3.5, (1.6, 1.05), 1.5)
+    hang(builder, prints.window, room, 'north', 5.5, (1.7, 1.25), 1.55)
+    hang(builder, prints.posters[0], room, 'east', 6.2, (0.62, 0.9))
+    hang(builder, prints.paintings[0], room, 'east', 8.4, (0.7, 0.7))
+    hang(builder, prints.boards[1], room, 'south', 3.6, (1.4, 0.95), 1.45)
+    hang(builder, prints.posters[1], room, 'south', 0.8, (0.66, 0.96))
+    hang(builder, prints.posters[2], room, 'south', 6.35, (0.66, 0.96))
     _bookshelf(builder, prints, (4.9, 5.7), 90.0, 0)
     _bookshelf(builder, prints, (0.18, 6.7), 0.0, 3)
     _lay(builder, prints.rugs[0], (3.6, 7.0, 0.008), (2.9, 1.9))
@@ -604,14 +604,14 @@ def _furnish_office(builder: _Builder, prints: _Prints, loose: np.random.Generat
     _clutter(builder, prints, loose, (3.2, 5.75, 4.1, 5.9, 0.0), 6)
 
 
-def _furnish_gallery(builder: _Builder, prints: _Prints, loose: np.random.Generator) -> None:
+def _furnish_gallery(builder: Builder, prints: _Prints, loose: np.random.Generator) -> None:
     room = GALLERY
     _gallery_wall(builder, prints, room, 'north', (7.6, 8.6, 9.6, 10.8, 11.8, 12.9))
     _gallery_wall(builder, prints, room, 'east', (6.2, 7.3, 8.4))
     _gallery_wall(builder, prints, room, 'south', (7.7, 8.8, 9.9, 13.2))
-    _hang(builder, prints.paintings[0], room, 'west', 8.45, (0.7, 0.7))
-    _hang(builder, prints.posters[3], room, 'west', 6.2, (0.66, 0.96))
-    _hang(builder, prints.paintings[1], room, 'south', 10.75, (0.55, 0.55))
+    hang(builder, prints.paintings[0], room, 'west', 8.45, (0.7, 0.7))
+    hang(builder, prints.posters[3], room, 'west', 6.2, (0.66, 0.96))
+    hang(builder, prints.paintings[1], room, 'south', 10.75, (0.55, 0.55))
     _lay(builder, prints.rugs[1], (9.3, 7.2, 0.008), (2.9, 1.9))
     for x, y in ((7.6, 8.5), (13.5, 8.5), (13.5, 6.1)):
         faces = {'side': prints.materials['marble_2'], 'any': prints.materials['marble_1']}
@@ -628,19 +628,19 @@ def _furnish_gallery(builder: _Builder, prints: _Prints, loose: np.random.Genera
     _stack_cartons(builder, prints, loose, (7.4, 5.9, 0.0), 2)
 
 
-def _furnish_workshop(builder: _Builder, prints: _Prints, loose: np.random.Generator) -> None:
+def _furnish_workshop(builder: Builder, prints: _Prints, loose: np.random.Generator) -> None:
     room = WORKSHOP
-    _hang(builder, prints.garage, room, 'west', 1.75, (2.3, 2.1), 1.06)
-    _hang(builder, prints.boards[2], room, 'south', 4.3, (1.6, 1.05), 1.5)
+    hang(builder, prints.garage, room, 'west', 1.75, (2.3, 2.1), 1.06)
+    hang(builder, prints.boards[2], room, 'south', 4.3, (1.6, 1.05), 1.5)
     _gallery_wall(builder, prints, room, 'south', (8.9, 9.9, 10.9))
-    _hang(builder, prints.posters[4], room, 'south', 5.6, (0.66, 0.96))
-    _hang(builder, prints.posters[5], room, 'south', 7.9, (0.66, 0.96))
-    _hang(builder, prints.boards[3], room, 'east', 1.9, (1.6, 1.05), 1.6)
-    _hang(builder, prints.posters[6], room, 'east', 0.6, (0.62, 0.9))
+    hang(builder, prints.posters[4], room, 'south', 5.6, (0.66, 0.96))
+    hang(builder, prints.posters[5], room, 'south', 7.9, (0.66, 0.96))
+    hang(builder, prints.boards[3], room, 'east', 1.9, (1.6, 1.05), 1.6)
+    hang(builder, prints.posters[6], room, 'east', 0.6, (0.62, 0.9))
     _gallery_wall(builder, prints, room, 'north', (3.7, 4.8, 5.8))
-    _hang(builder, prints.posters[7], room, 'north', 8.2, (0.66, 0.96))
-    _hang(builder, prints.posters[0], room, 'north', 9.2, (0.66, 0.96))
-    _hang(builder, prints.window, room, 'north', 10.5, (1.3, 1.0), 1.55)
+    hang(builder, prints.posters[7], room, 'north', 8.2, (0.66, 0.96))
+    hang(builder, prints.posters[0], room, 'north', 9.2, (0.66, 0.96))
+    hang(builder, prints.window, room, 'north', 10.5, (1.3, 1.0), 1.55)
     _table(builder, prints, (7.4, 1.72), (2.2, 0.7))
     _clutter(builder, prints, loose, (6.5, 1.5, 8.3, 1.95, 0.74), 14)
     _clutter(builder, prints, loose, (6.6, 1.6, 8.2, 1.85, 0.0), 6)
@@ -654,7 +654,7 @@ def _furnish_workshop(builder: _Builder, prints: _Prints, loose: np.random.Gener
     _chair(builder, prints, (11.0, 1.3 + loose.normal(0, 0.1)), np.pi + loose.normal(0, 0.4))
 
 
-def _furnish_corridor(builder: _Builder, prints: _Prints, loose: np.random.Generator) -> None:
+def _furnish_corridor(builder: Builder, prints: _Prints, loose: np.random.Generator) -> None:
     room = CORRIDOR
     doors = prints.doors
     for side, along, name in (
@@ -663,19 +663,19 @@ def _furnish_corridor(builder: _Builder, prints: _Prints, loose: np.random.Gener
         ('south', 4.6, 'door_steel_brown'), ('south', 9.4, 'door_steel_brown'),
         ('west', 4.5, 'door_steel_red'),
     ):  # fmt: skip
-        _hang(builder, doors[name], room, side, along, (0.95, 2.08), 1.05)
-    _hang(builder, prints.window, room, 'east', 4.5, (1.3, 1.0), 1.55)
+        hang(builder, doors[name], room, side, along, (0.95, 2.08), 1.05)
+    hang(builder, prints.window, room, 'east', 4.5, (1.3, 1.0), 1.55)
     for side, along, picture in (
         ('north', 0.8, prints.posters[8]), ('north', 3.2, prints.posters[9]),
         ('north', 13.2, prints.posters[1]), ('south', 0.6, prints.posters[2]),
         ('south', 5.7, prints.posters[6]), ('south', 13.5, prints.posters[8]),
     ):  # fmt: skip
-        _hang(builder, picture, room, side, along, (0.62, 0.9))
-    _hang(builder, prints.boards[3], room, 'north', 5.8, (1.5, 1.0), 1.45)
-    _hang(builder, prints.boards[0], room, 'south', 11.0, (1.5, 1.0), 1.45)
+        hang(builder, picture, room, side, along, (0.62, 0.9))
+    hang(builder, prints.boards[3], room, 'north', 5.8, (1.5, 1.0), 1.45)
+    hang(builder, prints.boards[0], room, 'south', 11.0, (1.5, 1.0), 1.45)
     _gallery_wall(builder, prints, room, 'south', (2.7, 3.5))
     _gallery_wall(builder, prints, room, 'north', (7.1, 7.95, 10.2))
-    _hang(builder, prints.paintings[1], room, 'south', 8.3, (0.7, 0.7))
+    hang(builder, prints.paintings[1], room, 'south', 8.3, (0.7, 0.7))
     builder.box((8.3, 3.78, 0.22), (1.2, 0.34, 0.44), {'any': prints.materials['wood_planks_1']})
     _clutter(builder, prints, loose, (7.9, 3.72, 8.7, 3.84, 0.44), 4)
     _stack_cartons(builder, prints, loose, (13.7, 5.1, 0.0), 3)
