@@ -136,6 +136,28 @@ def test_points_seen_by_and_covisibility_agree(bundle: Path) -> None:
             assert loaded.covisibility[first, second] == len(shared)
 
 
+def test_observers_of_a_point_are_the_images_that_see_it(bundle: Path) -> None:
+    loaded = load_map(bundle)
+
+    assert loaded.observers.shape == (len(loaded.points), loaded.num_images)
+    assert set(loaded.observers.data.tolist()) == {1}
+    for image in range(loaded.num_images):
+        seen = loaded.observers[:, [image]].nonzero()[0]
+        np.testing.assert_array_equal(np.sort(seen), loaded.points_seen_by(image))
+
+
+def test_camera_positions_are_where_the_poses_are(bundle: Path) -> None:
+    loaded = load_map(bundle)
+
+    assert loaded.camera_positions.shape == (loaded.num_images, 3)
+    for position, camera_from_map in zip(
+        loaded.camera_positions, loaded.camera_from_map, strict=True
+    ):
+        np.testing.assert_allclose(camera_from_map * position, np.zeros(3), atol=1e-9)
+    empty = replace(loaded, image_names=(), camera_from_map=())
+    assert empty.camera_positions.shape == (0, 3)
+
+
 def test_same_content_same_id_and_other_content_another(tmp_path: Path) -> None:
     ids = [
         save_map(tmp_path / name, random_content(seed), MANIFEST_TO_BE, None).map_id

@@ -126,6 +126,7 @@ def json_row(query: Query) -> dict[str, Any]:
         'inliers': result.inliers,
         'scene': result.scene,
         'scenes_tried': result.scenes_tried,
+        'confidence': result.confidence,
         'timings_ms': timings,
     }
     if result.estimate is not None:

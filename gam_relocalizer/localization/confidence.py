@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -46,7 +47,7 @@ class Evidence:
 
 # A logistic regression on right and wrong poses, fitted by scripts/fit_belief.py; in the order of
 # `Evidence.terms`.
-BELIEF = np.array([9.18, -0.762, -1.63, 2.54])
+BELIEF = np.array([8.95, -0.837, -1.47, 2.5])
 
 
 def scaled_residual(reprojection_error: float, longer_side: int) -> float:
@@ -61,7 +62,7 @@ def belief_in(evidence: Evidence) -> float:
 
 def odds(probability: float) -> float:
     """How often it is so for each time that it is not."""
-    return probability / max(1.0 - probability, np.finfo(float).tiny)
+    return probability / max(1.0 - probability, sys.float_info.epsilon)
 
 
 def nearness(covariance: NDArray[np.float64]) -> float:

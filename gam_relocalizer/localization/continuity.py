@@ -8,7 +8,7 @@ published.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -145,7 +145,7 @@ class Continuity:
                     f'the pose is off from where odometry has brought the robot since the last '
                     f'fix, by {against}; held back until another one confirms it'
                 )
-                return replace(result, status=Status.IMPLAUSIBLE, reason=reason)
+                return result.judged(Status.IMPLAUSIBLE, reason)
         self._place = _Place(stamp_ns, pose, odometry)
         return result
 

@@ -38,16 +38,18 @@ MIN_SIGMA_PX = 0.5
 # Share of the variance that neighbours have in common, and the distance, per longer side of the
 # image, at which 60 % of that is left. Measured: with these the errors of poses on rendered places
 # are as large as their covariance says (benchmarks/adversaries.py prints it).
-SHARED_VARIANCE = 0.12
+SHARED_VARIANCE = 0.05
 SHARED_DISTANCE = 0.15
 # A keypoint is known to about a pixel, at 1024 pixels and less. Larger residuals are errors of the
 # map or the calibration, all of which neighbours share.
-KEYPOINT_SIGMA_PX = 1.0
+KEYPOINT_SIGMA_PX = 1.3
 KEYPOINT_SIDE = 1024.0
 # Neighbours are treated together, in cells of a grid over the image.
 _CELLS = 8
 # A point seen from one direction has no depth; this many times its sideways error stands for it.
 _MAX_DEPTH_RATIO = 100.0
+# A point may lie in the very camera that saw it, in a damaged map; its square must not be zero.
+_LEAST_DISTANCE = 1e-100
 
 
 def point_covariances(scene_map: SceneMap, points: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -64,7 +66,7 @@ def point_covariances(scene_map: SceneMap, points: NDArray[np.int64]) -> NDArray
     rows = np.repeat(np.arange(len(points)), np.diff(observed.indptr))
     sight = scene_map.points[points][rows] - scene_map.camera_positions[observed.indices]
     distance = np.linalg.norm(sight, axis=1)
-    distance = np.maximum(distance, np.finfo(np.float64).tiny)
+    distance = np.maximum(distance, _LEAST_DISTANCE)
     sight /= distance[:, None]
     across = (np.eye(3) - sight[:, :, None] * sight[:, None, :]) / np.square(distance)[
         :, None, None
@@ -73,7 +75,6 @@ def point_covariances(scene_map: SceneMap, points: NDArray[np.int64]) -> NDArray
     np.add.at(information, rows, across)
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, values[:, 2:] / _MAX_DEPTH_RATIO**2)
-    values = np.maximum(values, np.finfo(np.float64).tiny)
     covariances: NDArray[np.float64] = np.einsum('kij,kj,klj->kil', vectors, 1.0 / values, vectors)
     return covariances
 

@@ -88,14 +88,18 @@ def _log_sigma(
     in_camera: NDArray[np.float64], keypoints: NDArray[np.float64], camera: pycolmap.Camera
 ) -> float:
     projected, across = projection_jacobians(camera, in_camera)
-    by_focal_length = projected - [camera.principal_point_x, camera.principal_point_y]
-    jacobians = np.dstack([movement_jacobians(in_camera, across), by_focal_length])
+    from_centre = projected - [camera.principal_point_x, camera.principal_point_y]
+    movements = movement_jacobians(in_camera, across)
+    # those models that have two focal lengths are refined in both, and their mean is asked for
+    two = len(camera.focal_length_idxs()) == 2
+    by_focal_lengths = from_centre[:, :, None] * np.eye(2) if two else from_centre[:, :, None]
+    jacobians = np.concatenate([movements, by_focal_lengths], axis=2)
     errors = np.linalg.norm(projected - keypoints, axis=1)
     sigma = sigma_of(errors)
     good = errors < _MAX_RESIDUAL_SIGMAS * sigma
     information = np.einsum('kij,kil->jl', jacobians[good], jacobians[good])
     try:
-        variance = np.linalg.inv(information)[6, 6] * sigma**2
+        variance = np.mean(np.linalg.inv(information)[6:, 6:]) * sigma**2
     except np.linalg.LinAlgError:
         return float('inf')
     return float(np.sqrt(variance)) if variance > 0 else float('inf')

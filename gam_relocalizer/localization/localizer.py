@@ -29,6 +29,7 @@ from gam_relocalizer.localization.confidence import (
 )
 from gam_relocalizer.localization.covariance import point_covariances
 from gam_relocalizer.localization.focal_length import focal_length_of
+from gam_relocalizer.localization.look_alikes import look_alike_of, points_around
 from gam_relocalizer.localization.pose import MIN_MATCHES, PoseOptions, estimate_pose
 from gam_relocalizer.localization.prior import Prior, tilt_deg
 from gam_relocalizer.localization.result import (
@@ -37,6 +38,7 @@ from gam_relocalizer.localization.result import (
     Status,
     Timings,
 )
+from gam_relocalizer.localization.retrieval import retrieve
 from gam_relocalizer.localization.scenes import Coarse, orientation_kept
 from gam_relocalizer.localization.search import candidates, search
 from gam_relocalizer.localization.support import support_of
@@ -45,6 +47,7 @@ from gam_relocalizer.localization.verdict import (
     coverage_of,
     judge,
     judge_focal_length,
+    judge_look_alike,
     judge_mirrored,
     judge_rival,
     judge_tilt,
@@ -63,7 +66,7 @@ if TYPE_CHECKING:
 
     from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor, LocalFeatures
-    from gam_relocalizer.localization.prior import Gravity
+    from gam_relocalizer.localization.look_alikes import LookAlike
     from gam_relocalizer.localization.scenes import Scene
     from gam_relocalizer.localization.search import Candidate
     from gam_relocalizer.localization.verdict import Verdict
@@ -178,28 +181,36 @@ class Localizer:
             features = self._extractor.extract(image)
         with clock.stage('retrieval'):
             described = self._describer.describe(image, features)
-        result = self._localize_described(features, described, camera, prior or Prior(), clock)
+        query = _Query(_seen_by(camera, features), described, camera, prior or Prior(), clock)
+        result = self._localize_query(query)
         if not result.accepted:
             return result
         with clock.stage('extraction'):
             verdict = self._judge_mirrored(image, described)
-        timings = clock.timings()
-        if verdict is None:
-            return replace(result, timings=timings)
-        return replace(result, status=verdict.status, reason=verdict.reason, timings=timings)
+        if verdict is not None:
+            result = result.judged(verdict.status, verdict.reason)
+        return replace(result, timings=clock.timings())
 
     def localize_features(
         self,
         features: LocalFeatures,
         described: NDArray[np.float32],
         camera: pycolmap.Camera,
-        prior: Prior | None = None,
     ) -> LocalizationResult:
         """The same for an image whose local features and global descriptor are known already.
 
         Without the image itself nothing can tell whether it is mirrored.
         """
-        return self._localize_described(features, described, camera, prior or Prior(), _Clock())
+        return self._localize_query(_Query(_seen_by(camera, features), described, camera))
+
+    def attempts(
+        self,
+        features: LocalFeatures,
+        described: NDArray[np.float32],
+        camera: pycolmap.Camera,
+    ) -> list[LocalizationResult]:
+        """One result for every scene tried, before they are held against each other."""
+        return self._attempts(_Query(_seen_by(camera, features), described, camera))
 
     def _judge_mirrored(
         self, image: NDArray[np.uint8], described: NDArray[np.float32]
@@ -216,45 +227,33 @@ class Localizer:
         )
         return judge_mirrored(likeness, mirrored_likeness)
 
-    def _localize_described(
-        self,
-        features: LocalFeatures,
-        described: NDArray[np.float32],
-        camera: pycolmap.Camera,
-        prior: Prior,
-        clock: _Clock,
-    ) -> LocalizationResult:
-        seen = _seen_by(camera, features)
-        result = self._localize_features(seen, described, camera, prior, clock)
-        return replace(result, keypoints=len(seen), timings=clock.timings())
+    def _localize_query(self, query: _Query) -> LocalizationResult:
+        result = self._best_of_scenes(query)
+        return replace(result, keypoints=len(query.features), timings=query.clock.timings())
 
-    def _localize_features(
-        self,
-        features: LocalFeatures,
-        described: NDArray[np.float32],
-        camera: pycolmap.Camera,
-        prior: Prior,
-        clock: _Clock,
-    ) -> LocalizationResult:
+    def _best_of_scenes(self, query: _Query) -> LocalizationResult:
         needed = self._options.verdict.min_inliers
-        if len(features) < needed:
+        if len(query.features) < needed:
             return LocalizationResult(
                 Status.TOO_FEW_FEATURES,
-                f'{len(features)} local features in the image, needs {needed}; it may be black, '
-                f'blurred or without texture',
+                f'{len(query.features)} local features in the image, needs {needed}; it may be '
+                f'black, blurred or without texture',
             )
-        ordered = candidates(described, self._scene_map, self._options, prior.hint)
-        attempts = search(
-            _timed(ordered, clock),
-            lambda scene: self._localize_in(scene, features, camera, prior.gravity, clock),
-            self._options.enough_inliers,
-        )
+        attempts = self._attempts(query)
         if not attempts:
             return LocalizationResult(
                 Status.NO_SCENE,
                 f'no reference image was retrieved; the map has {self._scene_map.num_images}',
             )
         return replace(self._uncontested(attempts), scenes_tried=len(attempts))
+
+    def _attempts(self, query: _Query) -> list[LocalizationResult]:
+        ordered = candidates(query.described, self._scene_map, self._options, query.prior.hint)
+        return search(
+            _timed(ordered, query.clock),
+            lambda scene: self._localize_in(scene, query),
+            self._options.enough_inliers,
+        )
 
     def _uncontested(self, attempts: Sequence[LocalizationResult]) -> LocalizationResult:
         """The best attempt; rejected when another scene speaks nearly as loud for another pose."""
@@ -267,19 +266,12 @@ class Localizer:
                 continue
             verdict = judge_rival(best.estimate, attempt.estimate, points, self._options.verdict)
             if verdict is not None:
-                return replace(best, status=verdict.status, reason=verdict.reason)
+                return best.judged(verdict.status, verdict.reason)
         return best
 
-    def _localize_in(
-        self,
-        scene: Scene,
-        features: LocalFeatures,
-        camera: pycolmap.Camera,
-        gravity: Gravity | None,
-        clock: _Clock,
-    ) -> LocalizationResult:
-        with clock.stage('matching'):
-            matches = self._match(scene, features, camera)
+    def _localize_in(self, scene: Scene, query: _Query) -> LocalizationResult:
+        with query.clock.stage('matching'):
+            matches = self._match(scene, query)
         name = self._scene_map.image_names[scene.image]
         result = LocalizationResult(
             Status.TOO_FEW_MATCHES,
@@ -290,63 +282,66 @@ class Localizer:
         if result.matches < needed:
             reason = f'{result.matches} matches with the scene around `{name}`, needs {needed}'
             return replace(result, reason=reason)
-        with clock.stage('pose'):
-            estimate = self._estimate(matches, features.keypoints, scene, camera)
+        with query.clock.stage('pose'):
+            estimate = self._estimate(matches, scene, query)
         if estimate is None:
             reason = f'the {result.matches} matches with the scene around `{name}` fit no pose'
             return replace(result, status=Status.NO_POSE, reason=reason)
-        with clock.stage('pose'):
-            verdict = self._judge(estimate, scene, camera, gravity)
-        return replace(
-            result,
-            status=verdict.status,
-            reason=verdict.reason,
-            estimate=estimate,
-            confidence=estimate.belief * nearness(estimate.covariance),
-        )
+        with query.clock.stage('pose'):
+            verdict = self._judge(estimate, scene, query)
+        confidence = estimate.belief * nearness(estimate.covariance)
+        found = replace(result, estimate=estimate, confidence=confidence)
+        return found.judged(verdict.status, verdict.reason)
 
-    def _judge(
-        self,
-        estimate: PoseEstimate,
-        scene: Scene,
-        camera: pycolmap.Camera,
-        gravity: Gravity | None,
-    ) -> Verdict:
-        camera_from_map = estimate.camera_from_map
+    def _judge(self, estimate: PoseEstimate, scene: Scene, query: _Query) -> Verdict:
+        """The cheap checks first; the others only for a pose that would be accepted."""
+        camera_from_map, gravity = estimate.camera_from_map, query.prior.gravity
         points = self._scene_map.points[estimate.inlier_points]
         kept = orientation_kept(camera_from_map, estimate.inlier_points, scene, self._scene_map)
         verdict = judge(estimate, points, kept, self._options.verdict)
         if verdict.status is not Status.ACCEPTED:
             return verdict
         keypoints = estimate.inlier_keypoints.astype(np.float64)
-        focal_length = focal_length_of(camera_from_map, keypoints, points, camera)
+        focal_length = focal_length_of(camera_from_map, keypoints, points, query.camera)
+        look_alike = self._look_alike(estimate, query)
         return (
             judge_focal_length(focal_length)
             or (gravity and judge_tilt(tilt_deg(camera_from_map, gravity), gravity.tolerance_deg))
+            or (look_alike and judge_look_alike(estimate, look_alike, points))
             or verdict
         )
 
-    def _match(self, scene: Scene, features: LocalFeatures, camera: pycolmap.Camera) -> Matches:
+    def _look_alike(self, estimate: PoseEstimate, query: _Query) -> LookAlike | None:
+        """What looks the same in all that was retrieved, the scene itself included."""
+        options = self._options
+        alike = retrieve(query.described, self._scene_map, options.retrieved_images)
+        around = points_around(alike.images.tolist(), self._scene_map, options.scene_images)
+        return look_alike_of(
+            estimate.camera_from_map,
+            estimate.inlier_features,
+            query.features,
+            query.camera,
+            around,
+            self._scene_map,
+            options.pose,
+        )
+
+    def _match(self, scene: Scene, query: _Query) -> Matches:
         # the matcher wants points as a camera near the query sees them
         reference_from_map = self._scene_map.camera_from_map[scene.image]
         given = MatchInput(
-            keypoints=normalise_keypoints(features.keypoints, camera),
-            focal_length=normalised_focal_length(camera),
-            descriptors=features.descriptors,
+            keypoints=normalise_keypoints(query.features.keypoints, query.camera),
+            focal_length=normalised_focal_length(query.camera),
+            descriptors=query.features.descriptors,
             points=reference_from_map * self._scene_map.points[scene.points],
             point_descriptors=self._scene_map.descriptors[scene.points],
         )
         return self._matcher.match(given)
 
-    def _estimate(
-        self,
-        matches: Matches,
-        keypoints_in_image: NDArray[np.float32],
-        scene: Scene,
-        camera: pycolmap.Camera,
-    ) -> PoseEstimate | None:
-        """The pose of matches between keypoints and points of a scene, and what speaks for it."""
-        keypoints = keypoints_in_image[matches.keypoint_indices]
+    def _estimate(self, matches: Matches, scene: Scene, query: _Query) -> PoseEstimate | None:
+        """The pose of matches between features and points of a scene, and what speaks for it."""
+        camera = query.camera
+        keypoints = query.features.keypoints[matches.keypoint_indices]
         points = scene.points[matches.point_indices]
         pose = estimate_pose(
             keypoints,
@@ -370,6 +365,7 @@ class Localizer:
             camera_from_map=pose.camera_from_map,
             covariance=pose.covariance,
             inlier_keypoints=inlier_keypoints,
+            inlier_features=matches.keypoint_indices[pose.inliers],
             inlier_points=inlier_points,
             inlier_ratio=len(inlier_keypoints) / len(np.unique(matches.keypoint_indices)),
             coverage=coverage,
@@ -395,6 +391,17 @@ class _Clock:
 
     def timings(self) -> Timings:
         return Timings(**self._milliseconds)
+
+
+@dataclass(frozen=True)
+class _Query:
+    """An image as the search for its pose knows it."""
+
+    features: LocalFeatures
+    described: NDArray[np.float32]
+    camera: pycolmap.Camera
+    prior: Prior = field(default_factory=Prior)
+    clock: _Clock = field(default_factory=_Clock)
 
 
 def _timed(scenes: Iterator[Candidate], clock: _Clock) -> Iterator[Candidate]:

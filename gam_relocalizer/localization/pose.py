@@ -52,6 +52,10 @@ class PoseOptions:
     guided: bool = True
     seed: int = 0
 
+    def threshold_px(self, camera: pycolmap.Camera) -> float:
+        """The greatest reprojection error in the search [px]."""
+        return self.max_error * max(camera.width, camera.height) / REFERENCE_SIDE
+
 
 @dataclass(frozen=True)
 class AbsolutePose:
@@ -112,7 +116,7 @@ def estimate_pose(
         points=local.from_map(points[distinct]),
         weights=np.asarray(weights[distinct], np.float64),
         camera=camera,
-        threshold=options.max_error * max(camera.width, camera.height) / REFERENCE_SIDE,
+        threshold=options.threshold_px(camera),
         nearest=np.ones(len(distinct), np.bool_) if nearest is None else nearest[distinct],
     )
     found = _search(matches, options)

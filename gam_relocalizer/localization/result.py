@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, unique
 from typing import TYPE_CHECKING
 
@@ -35,6 +35,10 @@ class Status(Enum):
     AMBIGUOUS = 19
     CONTRADICTED = 20
     MISCALIBRATED = 21
+
+
+# Something beyond the pose itself speaks against it.
+REFUTED = frozenset({Status.AMBIGUOUS, Status.MISCALIBRATED, Status.IMPLAUSIBLE})
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ class PoseEstimate:
         covariance: [6,6] of the camera's pose in the map, order of REP-103: x, y, z [m^2], then
             rotations about the fixed axes of the map [rad^2].
         inlier_keypoints: [K,2] pixels of the inliers (COLMAP convention).
+        inlier_features: [K] indices of the local features that they are.
         inlier_points: [K] indices into the map's points.
         inlier_ratio: Inliers per match.
         coverage: Share of the image that the inliers spread over, 0 to 1.
@@ -85,6 +90,7 @@ class PoseEstimate:
     camera_from_map: pycolmap.Rigid3d
     covariance: NDArray[np.float64]
     inlier_keypoints: NDArray[np.float32]
+    inlier_features: NDArray[np.int64]
     inlier_points: NDArray[np.int64]
     inlier_ratio: float
     coverage: float
@@ -112,7 +118,8 @@ class LocalizationResult:
         scene: Name of the reference image whose scene decided, or empty.
         scenes_tried: Number of scenes matched.
         confidence: Probability that the best pose found is within 0.25 m and 2 degrees of the
-            truth (map units where the map is not metric), 0 without one.
+            truth (map units where the map is not metric); 0 without one, and for one that is
+            refuted: ambiguous, miscalibrated or implausible.
         timings: Time per stage.
     """
 
@@ -125,6 +132,11 @@ class LocalizationResult:
     scenes_tried: int = 0
     confidence: float = 0.0
     timings: Timings = field(default_factory=Timings)
+
+    def judged(self, status: Status, reason: str) -> LocalizationResult:
+        """The same result with this verdict on its pose."""
+        confidence = 0.0 if status in REFUTED else self.confidence
+        return replace(self, status=status, reason=reason, confidence=confidence)
 
     @property
     def accepted(self) -> bool:

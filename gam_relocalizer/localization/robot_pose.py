@@ -34,11 +34,9 @@ class CovarianceMode(Enum):
 
 @dataclass(frozen=True)
 class CovarianceOptions:
-    """What is known about the errors beyond the reprojection errors of one image.
+    """What is known about the errors beyond what image and map tell.
 
-    The errors of a map's own points and poses are shared by all matches of an image, which its
-    residuals cannot show: on real maps with surveyed truth the errors were 1.5 to 2.4 times what
-    the residuals say, hence scales of 2.
+    The floors stand for what neither can know: the mount, the stamps, the survey behind the map.
 
     Attributes:
         position_scale: Factor on standard deviations of the position.
@@ -48,8 +46,8 @@ class CovarianceOptions:
         mode: `DIAGONAL` drops the correlations, for consumers that refuse negative elements.
     """
 
-    position_scale: float = 2.0
-    orientation_scale: float = 2.0
+    position_scale: float = 1.0
+    orientation_scale: float = 1.0
     position_floor: float = 0.01
     orientation_floor: float = 0.002
     mode: CovarianceMode = CovarianceMode.FULL

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gam_relocalizer.cameras import undistort
 from gam_relocalizer.localization.result import Support
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ _WITNESS_SHARE = 0.2
 # A point is expected in view if a witness saw it from about this direction and distance.
 _MAX_TURN_DEG = 40.0
 _MAX_ZOOM = 2.0
+# Where a pixel's ray is this near to a point (on the plane at unit depth), the point is seen there.
+_SAME_RAY = 0.05
 # Cells along each side of the image.
 _CELLS = 8
 
@@ -53,8 +56,7 @@ def support_of(
     """
     points = _expected_points(camera_from_map, inlier_points, scene, scene_map)
     in_camera = np.asarray(camera_from_map * scene_map.points[points], np.float64).reshape(-1, 3)
-    pixels = np.asarray(camera.img_from_cam(in_camera[in_camera[:, 2] > 0])).reshape(-1, 2)
-    pixels = pixels[((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)]
+    pixels = _seen_at(in_camera[in_camera[:, 2] > 0], camera)
     if not len(pixels):
         return Support(in_view=0, unmatched=1.0)
     matched = np.isin(_cells(pixels, camera), _cells(inlier_keypoints, camera))
@@ -83,6 +85,16 @@ def _expected_points(
         alike &= (far < _MAX_ZOOM * near) & (near < _MAX_ZOOM * far)
         expected.append(seen[alike])
     return np.unique(np.concatenate(expected))
+
+
+def _seen_at(in_camera: NDArray[np.float64], camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Pixels [K,2] of those of the points [N,3] in front of a camera that are in its image."""
+    pixels = np.asarray(camera.img_from_cam(in_camera)).reshape(-1, 2)
+    inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+    pixels, on_plane = pixels[inside], in_camera[inside, :2] / in_camera[inside, 2:]
+    # beyond their edge many models fold space back into the image, where another ray ends
+    seen = np.isclose(undistort(pixels, camera), on_plane, rtol=_SAME_RAY, atol=_SAME_RAY)
+    return pixels[seen.all(axis=1)]
 
 
 def _cells(pixels: NDArray[np.floating], camera: pycolmap.Camera) -> NDArray[np.int64]:

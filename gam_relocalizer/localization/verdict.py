@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     import pycolmap
     from numpy.typing import NDArray
 
+    from gam_relocalizer.geometry import PoseError
     from gam_relocalizer.localization.focal_length import FocalLength
+    from gam_relocalizer.localization.look_alikes import LookAlike
 
 # Coverage is counted on a grid of so many cells along each side of the image.
 GRID = 8
@@ -28,7 +30,12 @@ RIVAL_ROTATION_DEG = 5.0
 # A focal length that is off by less than this, or by less than so many standard deviations of what
 # the image tells of it, is no reason to doubt the calibration.
 FOCAL_LENGTH_TOLERANCE = 0.08
-FOCAL_LENGTH_SIGMAS = 4.0
+FOCAL_LENGTH_SIGMAS = 3.0
+# Inliers whose look-alikes agree on another pose: up to 0.23 were seen in rooms where every wall
+# has its own pictures, 0.27 and more in a corridor of identical doors.
+MAX_LOOK_ALIKE_SHARE = 0.25
+# Among the eight candidates of each keypoint so many agree on something by chance.
+MAX_LOOK_ALIKES_BY_CHANCE = 15
 # Images of a real place were seen to be up to 0.06 more like the map when mirrored.
 MIRROR_MARGIN = 0.1
 
@@ -63,7 +70,7 @@ class VerdictOptions:
     max_relative_std: float = 0.05
     max_rotation_std_deg: float = 2.0
     min_orientation_kept: float = 0.7
-    min_belief: float = 0.8
+    min_belief: float = 0.9
     min_odds_against_rival: float = 7.5
 
 
@@ -157,9 +164,8 @@ def judge_rival(
         inlier_points: [K,3] positions of the inliers of the best pose, map frame.
         options: The thresholds.
     """
-    apart = pose_error(rival.camera_from_map, best.camera_from_map)
-    near = RIVAL_POSITION_SHARE * _median_distance(best, inlier_points)
-    if apart.position <= near and apart.rotation_deg <= RIVAL_ROTATION_DEG:
+    apart = _contradiction(best, rival.camera_from_map, inlier_points)
+    if apart is None:
         return None
     if odds(best.belief) >= options.min_odds_against_rival * odds(rival.belief):
         return None
@@ -168,6 +174,28 @@ def judge_rival(
         f'{best.inliers} inliers speak for one pose and {rival.inliers} for another one '
         f'{apart.position:.3g} and {apart.rotation_deg:.0f} deg away, which is nearly as probable; '
         f'the place may look like another one in the map',
+    )
+
+
+def judge_look_alike(
+    estimate: PoseEstimate, look_alike: LookAlike, inlier_points: NDArray[np.float64]
+) -> Verdict | None:
+    """Rejects a pose when its inliers look like those of another place in the map.
+
+    Args:
+        estimate: The pose.
+        look_alike: Another pose, from what looks the same elsewhere.
+        inlier_points: [K,3] positions of the inliers, map frame.
+    """
+    apart = _contradiction(estimate, look_alike.camera_from_map, inlier_points)
+    by_chance = look_alike.agreeing <= MAX_LOOK_ALIKES_BY_CHANCE
+    if apart is None or by_chance or look_alike.share <= MAX_LOOK_ALIKE_SHARE:
+        return None
+    return Verdict(
+        Status.AMBIGUOUS,
+        f'{look_alike.share:.0%} of the inliers look like other points that speak for a pose '
+        f'{apart.position:.3g} and {apart.rotation_deg:.0f} deg away; the map has several such '
+        f'places',
     )
 
 
@@ -222,6 +250,17 @@ def worst_deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
     position = math.sqrt(float(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
     rotation = math.sqrt(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
     return position, math.degrees(rotation)
+
+
+def _contradiction(
+    estimate: PoseEstimate, rival: pycolmap.Rigid3d, inlier_points: NDArray[np.float64]
+) -> PoseError | None:
+    """How far a rival `camera_from_map` is from the estimate, if too far to mean the same."""
+    apart = pose_error(rival, estimate.camera_from_map)
+    near = RIVAL_POSITION_SHARE * _median_distance(estimate, inlier_points)
+    if apart.position <= near and apart.rotation_deg <= RIVAL_ROTATION_DEG:
+        return None
+    return apart
 
 
 def _median_distance(estimate: PoseEstimate, inlier_points: NDArray[np.float64]) -> float:

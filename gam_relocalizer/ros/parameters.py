@@ -180,6 +180,16 @@ class NodeParameters:
         'Greatest standard deviation of the orientation [deg].',
         bounds=(1e-6, 180.0),
     )
+    min_belief: float = _parameter(
+        _VERDICT.min_belief,
+        'Least probability that the pose is right and not of a place that looks alike.',
+        bounds=(0.0, 1.0),
+    )
+    min_odds_against_rival: float = _parameter(
+        _VERDICT.min_odds_against_rival,
+        'A fix must have so many times the odds of a pose elsewhere that another scene gives.',
+        bounds=(1.0, 1e6),
+    )
     odometry_drift: float = _parameter(
         _CONTINUITY.drift,
         'Share of the way, and of the turns, that the odometry may be off; a fix that is further '
@@ -292,6 +302,8 @@ class NodeParameters:
                 min_coverage=self.min_coverage,
                 max_relative_std=self.max_relative_std,
                 max_rotation_std_deg=self.max_rotation_std_deg,
+                min_belief=self.min_belief,
+                min_odds_against_rival=self.min_odds_against_rival,
             ),
         )
 

@@ -8,6 +8,7 @@ view, and the extractor answers with that view's features.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +29,7 @@ from gam_relocalizer.scene_map import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Sequence
 
 IDENTITY = ExtractorIdentity('synthetic', 64, 'none')
 CAMERA = pycolmap.Camera(
@@ -142,6 +143,24 @@ def twin_of(place: Place, offset: np.ndarray) -> tuple[Place, list[pycolmap.Rigi
     back = pycolmap.Rigid3d(rotation=pycolmap.Rotation3d(), translation=-offset)
     ring = [ring_pose(index) for index in range(NUM_IMAGES)]
     return twins, [*ring, *(pose * back for pose in ring)]
+
+
+def bare_map(
+    points: np.ndarray, poses: Sequence[pycolmap.Rigid3d], seen: Sequence[np.ndarray]
+) -> SceneMap:
+    """A map of points, and of which of them each camera sees; nothing looks like anything."""
+    return SceneMap(
+        path=Path('nowhere'),
+        manifest=Manifest(IDENTITY, RETRIEVAL_NAME, MapFrame(), {}),
+        image_names=tuple(f'{index:03}.png' for index in range(len(poses))),
+        camera_from_map=tuple(poses),
+        points=points,
+        descriptors=np.zeros((len(points), 64), np.float16),
+        observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
+        observation_points=np.concatenate(seen).astype(np.int32),
+        global_descriptors=np.zeros((len(poses), 16), np.float32),
+        codebook=np.zeros((0, 64), np.float32),
+    )
 
 
 def save_place(

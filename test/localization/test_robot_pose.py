@@ -36,6 +36,7 @@ def make_estimate(camera_from_map: pycolmap.Rigid3d, covariance: np.ndarray) -> 
         camera_from_map=camera_from_map,
         covariance=covariance,
         inlier_keypoints=np.zeros((0, 2), np.float32),
+        inlier_features=np.zeros(0, np.int64),
         inlier_points=np.zeros(0, np.int64),
         inlier_ratio=1.0,
         coverage=1.0,

@@ -45,6 +45,7 @@ def result_with(inliers: int) -> LocalizationResult:
         camera_from_map=pycolmap.Rigid3d(),
         covariance=np.eye(6),
         inlier_keypoints=np.zeros((inliers, 2), np.float32),
+        inlier_features=np.arange(inliers),
         inlier_points=np.arange(inliers),
         inlier_ratio=1.0,
         coverage=1.0,

@@ -4,22 +4,33 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from gam_relocalizer.geometry import rigid3d_from
+from gam_relocalizer.localization.focal_length import FocalLength
+from gam_relocalizer.localization.look_alikes import LookAlike
 from gam_relocalizer.localization.pose import estimate_pose
 from gam_relocalizer.localization.result import PoseEstimate, Status, Support
 from gam_relocalizer.localization.verdict import (
+    FOCAL_LENGTH_SIGMAS,
+    FOCAL_LENGTH_TOLERANCE,
+    MAX_LOOK_ALIKE_SHARE,
+    MIRROR_MARGIN,
     VerdictOptions,
     coverage_of,
     judge,
+    judge_focal_length,
+    judge_look_alike,
+    judge_mirrored,
     judge_rival,
+    judge_tilt,
     worst_deviations,
 )
 
@@ -33,6 +44,7 @@ GOOD = PoseEstimate(
     camera_from_map=rigid3d_from([1, 0, 0, 0], [0, 0, 0]),
     covariance=np.diag([1e-4] * 3 + [1e-6] * 3),
     inlier_keypoints=RNG.uniform([0, 0], [640, 480], (100, 2)).astype(np.float32),
+    inlier_features=np.arange(100),
     inlier_points=np.arange(100),
     inlier_ratio=0.3,
     coverage=0.5,
@@ -53,6 +65,7 @@ def test_accepts_a_good_estimate() -> None:
         ({'coverage': OPTIONS.min_coverage / 2}, Status.POOR_COVERAGE),
         ({'covariance': np.diag([1.0, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6])}, Status.UNCERTAIN),
         ({'covariance': np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 0.01])}, Status.UNCERTAIN),
+        ({'belief': OPTIONS.min_belief - 0.01}, Status.CONTRADICTED),
     ],
 )
 def test_names_what_is_wrong(changes: dict[str, object], status: Status) -> None:
@@ -70,35 +83,105 @@ def test_refuses_a_mirrored_view() -> None:
 def test_refuses_few_inliers() -> None:
     few = OPTIONS.min_inliers - 1
     estimate = replace(
-        GOOD, inlier_keypoints=GOOD.inlier_keypoints[:few], inlier_points=np.arange(few)
+        GOOD,
+        inlier_keypoints=GOOD.inlier_keypoints[:few],
+        inlier_features=np.arange(few),
+        inlier_points=np.arange(few),
     )
     assert judge(estimate, POINTS[:few], 1.0, OPTIONS).status is Status.TOO_FEW_INLIERS
 
 
-def rival(position: float, turn_deg: float, inliers: int) -> PoseEstimate:
+def rival(position: float, turn_deg: float, belief: float = GOOD.belief) -> PoseEstimate:
     half = np.radians(turn_deg) / 2.0
     return replace(
         GOOD,
         camera_from_map=rigid3d_from([np.cos(half), 0.0, np.sin(half), 0.0], [position, 0, 0]),
-        inlier_points=np.arange(inliers),
+        belief=belief,
     )
 
 
 @pytest.mark.parametrize(
     ('other', 'status'),
     [
-        (rival(3.0, 0.0, 85), Status.AMBIGUOUS),
-        (rival(0.0, 90.0, 85), Status.AMBIGUOUS),
-        (rival(3.0, 0.0, 75), None),
-        (rival(0.2, 3.0, 100), None),
+        (rival(3.0, 0.0), Status.AMBIGUOUS),
+        (rival(0.0, 90.0), Status.AMBIGUOUS),
+        (rival(3.0, 0.0, belief=1.0), Status.AMBIGUOUS),
+        (rival(3.0, 0.0, belief=0.3), None),
+        (rival(0.2, 3.0), None),
     ],
-    ids=['elsewhere', 'turned', 'elsewhere with few inliers', 'the same pose again'],
+    ids=['elsewhere', 'turned', 'more probable', 'hardly probable', 'the same pose again'],
 )
 def test_refuses_a_pose_that_another_scene_contradicts(
     other: PoseEstimate, status: Status | None
 ) -> None:
     verdict = judge_rival(GOOD, other, POINTS, OPTIONS)
     assert (verdict and verdict.status) is status
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_no_rival_makes_a_pose_ambiguous_that_a_more_probable_one_leaves(
+    first: float, second: float
+) -> None:
+    weak, strong = (rival(3.0, 0.0, belief) for belief in sorted((first, second)))
+    if judge_rival(GOOD, strong, POINTS, OPTIONS) is None:
+        assert judge_rival(GOOD, weak, POINTS, OPTIONS) is None
+
+
+def test_of_two_equally_probable_poses_none_is_sure() -> None:
+    lenient = replace(OPTIONS, min_odds_against_rival=1.01)
+    for belief in (0.5, 0.99, 1.0):
+        best, other = replace(GOOD, belief=belief), rival(3.0, 0.0, belief)
+        assert judge_rival(best, other, POINTS, lenient).status is Status.AMBIGUOUS
+
+
+@pytest.mark.parametrize(
+    ('ratio', 'log_sigma', 'status'),
+    [
+        (1.0, 0.001, None),
+        (1.0 + FOCAL_LENGTH_TOLERANCE / 2, 0.001, None),
+        (1.2, 0.01, Status.MISCALIBRATED),
+        (1.0 / 1.2, 0.01, Status.MISCALIBRATED),
+        (1.2, 0.1, None),
+        (5.0, math.inf, None),
+    ],
+    ids=['right', 'nearly right', 'too short', 'too long', 'vague', 'a flat wall'],
+)
+def test_refuses_a_focal_length_that_the_image_speaks_against(
+    ratio: float, log_sigma: float, status: Status | None
+) -> None:
+    verdict = judge_focal_length(FocalLength(ratio, log_sigma))
+    assert (verdict and verdict.status) is status
+
+
+@given(st.floats(0.2, 5.0), st.floats(1e-4, 0.2))
+def test_too_long_is_as_wrong_as_too_short(ratio: float, log_sigma: float) -> None:
+    off = abs(math.log(ratio)) - max(FOCAL_LENGTH_TOLERANCE, FOCAL_LENGTH_SIGMAS * log_sigma)
+    assume(abs(off) > 1e-9)
+    too_long, too_short = (
+        judge_focal_length(FocalLength(each, log_sigma)) for each in (ratio, 1.0 / ratio)
+    )
+    assert (too_long is None) == (too_short is None)
+
+
+def test_refuses_a_pose_that_leans_further_than_it_may() -> None:
+    assert judge_tilt(14.9, 15.0) is None
+    assert judge_tilt(15.1, 15.0).status is Status.IMPLAUSIBLE
+    assert judge_tilt(180.0, 180.0) is None
+
+
+def test_refuses_an_image_that_is_more_like_the_map_when_mirrored() -> None:
+    assert judge_mirrored(0.6, 0.3) is None
+    assert judge_mirrored(0.6, 0.6) is None
+    assert judge_mirrored(0.3, 0.3 + MIRROR_MARGIN + 0.01).status is Status.IMPLAUSIBLE
+
+
+def test_refuses_a_pose_whose_inliers_look_like_another_place() -> None:
+    elsewhere, here = rival(3.0, 0.0).camera_from_map, rival(0.2, 3.0).camera_from_map
+    many, few = MAX_LOOK_ALIKE_SHARE + 0.01, MAX_LOOK_ALIKE_SHARE - 0.01
+    assert judge_look_alike(GOOD, LookAlike(elsewhere, 100, many), POINTS).status is Status.AMBIGUOUS
+    assert judge_look_alike(GOOD, LookAlike(elsewhere, 100, few), POINTS) is None
+    assert judge_look_alike(GOOD, LookAlike(elsewhere, 7, many), POINTS) is None
+    assert judge_look_alike(GOOD, LookAlike(here, 100, 1.0), POINTS) is None
 
 
 @given(st.floats(1e-3, 1e3))
@@ -167,6 +250,7 @@ def test_random_matches_are_never_accepted(count: int) -> None:
             camera_from_map=pose.camera_from_map,
             covariance=pose.covariance,
             inlier_keypoints=keypoints[pose.inliers].astype(np.float32),
+            inlier_features=np.flatnonzero(pose.inliers),
             inlier_points=np.flatnonzero(pose.inliers),
             inlier_ratio=float(np.mean(pose.inliers)),
             coverage=coverage_of(keypoints[pose.inliers], CAMERA),

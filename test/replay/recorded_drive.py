@@ -103,6 +103,7 @@ def estimate_at(index: int, camera: pycolmap.Camera, points: NDArray[np.float64]
         camera_from_map=camera_from_map,
         covariance=np.diag([1e-4, 4e-4, 1e-4, 1e-5, 1e-5, 1e-5]),
         inlier_keypoints=(pixels[chosen] + 0.3).astype(np.float32),
+        inlier_features=chosen,
         inlier_points=chosen,
         inlier_ratio=0.5,
         coverage=0.6,

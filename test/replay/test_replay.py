@@ -48,9 +48,9 @@ def assert_same_pose(found: pycolmap.Rigid3d, truth: pycolmap.Rigid3d) -> None:
 
 def replay_of(
     path: Path,
-    fill: Any,
+    fill: Any,  # noqa: ANN401
     localizer: KnowingLocalizer,
-    options: ReplayOptions = MOUNTED,  # noqa: ANN401
+    options: ReplayOptions = MOUNTED,
 ) -> Replay:
     return replay_bag(write_bag(path / 'bag', fill), localizer, options)
 

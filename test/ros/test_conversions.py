@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -37,6 +40,7 @@ from gam_relocalizer.ros.conversions import (
 )
 from gam_relocalizer_msgs.msg import RelocalizationStatus
 
+REPOSITORY = Path(__file__).parents[2]
 HEADER = Header(stamp=Time(sec=3, nanosec=4), frame_id='map')
 PIXELS = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
 
@@ -144,6 +148,7 @@ def test_a_status_survives_the_wire() -> None:
         camera_from_map=rigid3d_from((1, 0, 0, 0), (0, 0, 0)),
         covariance=np.eye(6),
         inlier_keypoints=np.zeros((5, 2), np.float32),
+        inlier_features=np.arange(5),
         inlier_points=np.arange(5),
         inlier_ratio=np.float64(0.5),
         coverage=np.float32(0.25),
@@ -159,6 +164,7 @@ def test_a_status_survives_the_wire() -> None:
         matches=10,
         scene='a.jpg',
         scenes_tried=2,
+        confidence=np.float64(0.75),
         timings=Timings(1.0, 2.0, 3.0, 4.0),
     )
     sent = status_message(result, HEADER, 'abc')
@@ -168,7 +174,25 @@ def test_a_status_survives_the_wire() -> None:
     assert (status.scene, status.scenes_tried) == ('a.jpg', 2)
     assert (status.keypoints, status.matches, status.inliers) == (20, 10, 5)
     assert (status.inlier_ratio, status.coverage) == (0.5, 0.25)
-    assert (status.reprojection_error_px, status.total_ms) == (1.5, 10.0)
+    assert (status.reprojection_error_px, status.confidence) == (1.5, 0.75)
+    assert status.total_ms == 10.0
+
+
+def test_statuses_have_the_numbers_of_the_message() -> None:
+    file = REPOSITORY / 'gam_relocalizer_msgs' / 'msg' / 'RelocalizationStatus.msg'
+    text = file.read_text(encoding='utf-8')
+    constants = re.findall(r'^uint8 ([A-Z_]+)=(\d+)$', text, re.MULTILINE)
+    assert {name: int(number) for name, number in constants} == {
+        status.name: status.value for status in Status
+    }
+    for status in Status:
+        assert getattr(RelocalizationStatus, status.name) == status.value
+
+
+def test_the_documentation_tells_what_to_do_about_every_status() -> None:
+    page = (REPOSITORY / 'docs' / 'ros_interface.md').read_text(encoding='utf-8')
+    rows = re.findall(r'^\| (\d+ [A-Z_]+) \| .+ \|$', page, re.MULTILINE)
+    assert rows == [f'{status.value} {status.name}' for status in Status]
 
 
 @pytest.mark.parametrize('status', Status)

@@ -16,6 +16,7 @@ from gam_relocalizer.errors import UsageError
 from gam_relocalizer.localization.continuity import ContinuityOptions
 from gam_relocalizer.localization.localizer import LocalizerOptions
 from gam_relocalizer.localization.robot_pose import CovarianceMode, CovarianceOptions
+from gam_relocalizer.localization.verdict import VerdictOptions
 from gam_relocalizer.ros.node import RelocalizerNode
 from gam_relocalizer.ros.parameters import SPECIFICATIONS, NodeParameters
 
@@ -45,10 +46,19 @@ def test_defaults_are_those_of_the_localizer() -> None:
 
 
 def test_thresholds_and_covariance_reach_the_core() -> None:
+    thresholds = {
+        'min_inliers': 33,
+        'min_inlier_ratio': 0.11,
+        'min_coverage': 0.22,
+        'max_relative_std': 0.33,
+        'max_rotation_std_deg': 4.4,
+        'min_belief': 0.55,
+        'min_odds_against_rival': 6.6,
+    }
     parameters = NodeParameters(
-        min_inliers=33, scene_images=7, position_covariance_scale=4.0, covariance_mode='diagonal'
+        **thresholds, scene_images=7, position_covariance_scale=4.0, covariance_mode='diagonal'
     )
-    assert parameters.localizer_options().verdict.min_inliers == 33
+    assert parameters.localizer_options().verdict == VerdictOptions(**thresholds)
     assert parameters.localizer_options().scene_images == 7
     # a factor on the covariance is the square of one on the standard deviation
     assert parameters.covariance_options().position_scale == 2.0
