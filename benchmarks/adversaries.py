@@ -101,6 +101,7 @@ class Record:
         milliseconds: For the whole query.
         is_right: The best pose found is no false one, accepted or not.
         is_correct: It is what the confidence promises.
+        belief: That this pose is right, by its evidence alone.
         inliers: Of that pose.
         inlier_ratio: Per match.
         coverage: Share of the image.
@@ -124,6 +125,7 @@ class Record:
     milliseconds: float = 0.0
     is_right: bool = False
     is_correct: bool = False
+    belief: float = 0.0
     inliers: int = 0
     inlier_ratio: float = 0.0
     coverage: float = 0.0
@@ -306,6 +308,7 @@ def _record(
     found = replace(
         found,
         is_right=not is_false_accept(estimate.camera_from_map, truth, metre),
+        belief=estimate.belief,
         inliers=estimate.inliers,
         inlier_ratio=estimate.inlier_ratio,
         coverage=estimate.coverage,

@@ -74,7 +74,7 @@ FEWEST_TRUE = 20
 WITHIN = THRESHOLDS[2]
 _NAME_OF_WITHIN = f'{100 * WITHIN.position:.0f} cm / {WITHIN.rotation_deg:.0f} deg'
 CAPS = (100, 1000)
-MINIMA = (20, 100)
+MINIMA = (20, 500)
 
 
 @dataclass(frozen=True)

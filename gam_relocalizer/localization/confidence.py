@@ -47,7 +47,7 @@ class Evidence:
 
 # A logistic regression on right and wrong poses, fitted by scripts/fit_belief.py; in the order of
 # `Evidence.terms`.
-BELIEF = np.array([8.95, -0.837, -1.47, 2.5])
+BELIEF = np.array([7.59, -0.51, -1.78, 2.36])
 
 
 def scaled_residual(reprojection_error: float, longer_side: int) -> float:

@@ -70,7 +70,7 @@ class VerdictOptions:
     max_relative_std: float = 0.05
     max_rotation_std_deg: float = 2.0
     min_orientation_kept: float = 0.7
-    min_belief: float = 0.9
+    min_belief: float = 0.96
     min_odds_against_rival: float = 7.5
 
 
