@@ -45,6 +45,9 @@ class Evidence:
         return np.array([self.coverage, self.residual, self.unmatched, 1.0])
 
 
+# A wrong pose is hardly ever where the right one is expected; how seldom depends on the map, and on
+# the last fix being right. This is less than one would guess for a single room.
+EXPECTED_ODDS = 20.0
 # A logistic regression on right and wrong poses, fitted by scripts/fit_belief.py; in the order of
 # `Evidence.terms`.
 BELIEF = np.array([7.59, -0.51, -1.78, 2.36])
@@ -58,6 +61,12 @@ def scaled_residual(reprojection_error: float, longer_side: int) -> float:
 def belief_in(evidence: Evidence) -> float:
     """Probability that a pose is right: of this very place, not of one that looks alike."""
     return float(expit(BELIEF @ evidence.terms))
+
+
+def belief_as_expected(belief: float) -> float:
+    """The belief in a pose that is also where odometry has brought the robot."""
+    raised = EXPECTED_ODDS * odds(belief)
+    return raised / (1.0 + raised)
 
 
 def odds(probability: float) -> float:

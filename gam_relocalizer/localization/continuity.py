@@ -24,7 +24,7 @@ from gam_relocalizer.localization.odometry import (
     OdometryTrack,
     predict,
 )
-from gam_relocalizer.localization.prior import Gravity, PositionHint, Prior
+from gam_relocalizer.localization.prior import Expectation, Gravity, PositionHint, Prior
 from gam_relocalizer.localization.result import Status
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ MAX_SPEED = 2.0
 # Images taken further apart than that hardly show the same [m].
 MIN_HINT_RADIUS = 3.0
 ANY_TILT_DEG = 180.0
+# Odometry that may be off further is no evidence for a pose [m].
+MAX_EXPECTED_POSITION = 1.0
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,12 @@ def is_odometry_of(child_frame: str, base_frame: str) -> bool:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where the robot was, and when."""
+    """Where the robot was, and when; by a fix, or because somebody says so."""
 
     stamp_ns: int
     pose: RobotPose
     odometry: OdometryReading | None
+    is_fix: bool
 
 
 class Continuity:
@@ -116,9 +119,13 @@ class Continuity:
         if not self.options.metric:
             return Prior()
         if self._suggested is not None:
-            self._place = _Place(stamp_ns, self._suggested, self._track.at(stamp_ns))
+            self._place = _Place(stamp_ns, self._suggested, self._track.at(stamp_ns), is_fix=False)
             self._suggested = None
-        return Prior(self._hint(stamp_ns, base_from_camera), self._gravity(base_from_camera))
+        return Prior(
+            self._hint(stamp_ns, base_from_camera),
+            self._gravity(base_from_camera),
+            self._expectation(stamp_ns, base_from_camera),
+        )
 
     def judge(
         self, stamp_ns: int, result: LocalizationResult, pose: RobotPose
@@ -146,7 +153,7 @@ class Continuity:
                     f'fix, by {against}; held back until another one confirms it'
                 )
                 return result.judged(Status.IMPLAUSIBLE, reason)
-        self._place = _Place(stamp_ns, pose, odometry)
+        self._place = _Place(stamp_ns, pose, odometry, is_fix=True)
         return result
 
     @property
@@ -181,6 +188,24 @@ class Continuity:
             radius = SIGMAS * variance**0.5 + MAX_SPEED * seconds
         map_from_camera = map_from_base * (base_from_camera or pycolmap.Rigid3d())
         return PositionHint(map_from_camera.translation, max(MIN_HINT_RADIUS, radius))
+
+    def _expectation(
+        self, stamp_ns: int, base_from_camera: pycolmap.Rigid3d | None
+    ) -> Expectation | None:
+        """What odometry makes of the last fix; nothing when it may be off too far to tell."""
+        place, odometry = self._place, self._track.at(stamp_ns)
+        if base_from_camera is None or odometry is None:
+            return None
+        if place is None or not place.is_fix or place.odometry is None:
+            return None
+        prediction = predict(Fix(place.pose, place.odometry), odometry, self.options.drift)
+        if prediction.margin.position > MAX_EXPECTED_POSITION:
+            return None
+        return Expectation(
+            (prediction.map_from_base * base_from_camera).inverse(),
+            prediction.margin.position,
+            prediction.margin.rotation_deg,
+        )
 
     def _gravity(self, base_from_camera: pycolmap.Rigid3d | None) -> Gravity | None:
         if base_from_camera is None or self.options.max_tilt_deg >= ANY_TILT_DEG:

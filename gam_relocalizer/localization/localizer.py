@@ -23,6 +23,7 @@ from gam_relocalizer.features.registry import (
 from gam_relocalizer.features.vlad import Vlad
 from gam_relocalizer.localization.confidence import (
     Evidence,
+    belief_as_expected,
     belief_in,
     nearness,
     scaled_residual,
@@ -361,6 +362,10 @@ class Localizer:
         coverage = coverage_of(inlier_keypoints, camera)
         error = float(np.sqrt(np.mean(np.square(pose.errors[pose.inliers]))))
         residual = scaled_residual(error, max(camera.width, camera.height))
+        belief = belief_in(Evidence(coverage, residual, support.unmatched))
+        expectation = query.prior.expectation
+        if expectation is not None and expectation.agrees_with(pose.camera_from_map):
+            belief = belief_as_expected(belief)
         return PoseEstimate(
             camera_from_map=pose.camera_from_map,
             covariance=pose.covariance,
@@ -371,7 +376,7 @@ class Localizer:
             coverage=coverage,
             reprojection_error=error,
             support=support,
-            belief=belief_in(Evidence(coverage, residual, support.unmatched)),
+            belief=belief,
         )
 
 

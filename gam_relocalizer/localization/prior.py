@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gam_relocalizer.errors import UsageError
-from gam_relocalizer.geometry import rotation_of
+from gam_relocalizer.geometry import pose_error, rotation_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -74,16 +74,44 @@ class Gravity:
 
 
 @dataclass(frozen=True)
+class Expectation:
+    """Where odometry has brought the camera since the last fix.
+
+    A pose that agrees is easier to believe: a wrong one would have to be wrong in this very way. A
+    pose that does not agree is not harder to believe, so a wrong expectation costs no fix.
+
+    Attributes:
+        camera_from_map: The pose expected.
+        position_margin: How far off it may be [map units].
+        rotation_margin_deg: How far turned it may be.
+    """
+
+    camera_from_map: pycolmap.Rigid3d
+    position_margin: float
+    rotation_margin_deg: float
+
+    def agrees_with(self, camera_from_map: pycolmap.Rigid3d) -> bool:
+        """Whether a pose is as expected."""
+        apart = pose_error(camera_from_map, self.camera_from_map)
+        return (
+            apart.position <= self.position_margin
+            and apart.rotation_deg <= self.rotation_margin_deg
+        )
+
+
+@dataclass(frozen=True)
 class Prior:
     """All that is known; nothing by default.
 
     Attributes:
         hint: Where to look first.
         gravity: Only for maps whose z axis points up.
+        expectation: Which pose to believe sooner.
     """
 
     hint: PositionHint | None = None
     gravity: Gravity | None = None
+    expectation: Expectation | None = None
 
 
 def tilt_deg(camera_from_map: pycolmap.Rigid3d, gravity: Gravity) -> float:

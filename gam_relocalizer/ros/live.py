@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from rclpy.node import Node
 
 NODE_NAME = 'gam_relocalizer'
-PLAYED_TOPICS = ('/tf_static', '/camera/image', '/camera/camera_info')
+PLAYED_TOPICS = ('/tf_static', '/odom', '/camera/image', '/camera/camera_info')
 START_LIMIT_S = 90.0
 ANSWER_LIMIT_S = 20.0
 QUIET_S = 3.0

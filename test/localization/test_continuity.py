@@ -208,3 +208,38 @@ def test_odometry_counts_only_for_the_body_whose_poses_are_wanted() -> None:
     assert is_odometry_of('', 'base_link')
     assert not is_odometry_of('camera', 'base_link')
     assert not is_odometry_of('', '')
+
+
+def test_after_a_fix_the_pose_that_odometry_makes_of_it_is_expected() -> None:
+    continuity = Continuity()
+    drive(continuity, 0, 10, 1.0)
+    fix(continuity, 2.0, planar(-3.0, 0.0, 180.0))
+    expected = continuity.prior(6 * SECOND, BASE_FROM_CAMERA).expectation
+    assert expected is not None
+    moved = (planar(-7.0, 0.0, 180.0) * BASE_FROM_CAMERA).inverse()
+    assert expected.agrees_with(moved)
+    aside = (planar(-7.0, expected.position_margin + 0.01, 180.0) * BASE_FROM_CAMERA).inverse()
+    assert not expected.agrees_with(aside)
+    turned = (planar(-7.0, 0.0, 181.0 + expected.rotation_margin_deg) * BASE_FROM_CAMERA).inverse()
+    assert not expected.agrees_with(turned)
+
+
+def test_nothing_is_expected_without_a_fix_and_odometry_and_the_mount() -> None:
+    continuity = Continuity()
+    fix(continuity, 0.0, planar(0.0, 0.0))
+    assert continuity.prior(SECOND, BASE_FROM_CAMERA).expectation is None
+    drive(continuity, 0, 10, 1.0)
+    assert continuity.prior(SECOND, BASE_FROM_CAMERA).expectation is None
+    fix(continuity, 2.0, planar(2.0, 0.0))
+    assert continuity.prior(3 * SECOND, None).expectation is None
+    assert continuity.prior(3 * SECOND, BASE_FROM_CAMERA).expectation is not None
+    continuity.suggest(robot_at(planar(3.0, 0.0)))
+    assert continuity.prior(3 * SECOND, BASE_FROM_CAMERA).expectation is None
+
+
+def test_odometry_over_a_long_way_makes_nothing_expected() -> None:
+    continuity = Continuity(ContinuityOptions(drift=0.1))
+    drive(continuity, 0, 20, 1.0)
+    fix(continuity, 0.0, planar(0.0, 0.0))
+    assert continuity.prior(2 * SECOND, BASE_FROM_CAMERA).expectation is not None
+    assert continuity.prior(19 * SECOND, BASE_FROM_CAMERA).expectation is None

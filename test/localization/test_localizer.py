@@ -30,7 +30,7 @@ from synthetic_place import (
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.geometry import pose_error
 from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
-from gam_relocalizer.localization.prior import Gravity, PositionHint, Prior
+from gam_relocalizer.localization.prior import Expectation, Gravity, PositionHint, Prior
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.scenes import Coarse
 from gam_relocalizer.localization.verdict import VerdictOptions
@@ -380,3 +380,43 @@ def test_refuses_a_map_of_another_retrieval(scene_map: SceneMap) -> None:
 def test_load_refuses_a_map_of_an_unknown_extractor(scene_map: SceneMap) -> None:
     with pytest.raises(MapError):
         Localizer.load(scene_map.path)
+
+
+def weak_view(view: int) -> LocalFeatures:
+    """A quarter of the image, so that alone it convinces nobody."""
+    features = features_of(PLACE, query_pose(view), seed=view)
+    kept = (features.keypoints < [0.55 * CAMERA.width, 0.55 * CAMERA.height]).all(axis=1)
+    return replace(
+        features,
+        keypoints=features.keypoints[kept],
+        descriptors=features.descriptors[kept],
+        scores=features.scores[kept],
+    )
+
+
+def test_a_pose_that_is_expected_is_believed_sooner(scene_map: SceneMap) -> None:
+    options = LocalizerOptions(verdict=VerdictOptions(min_belief=0.0))
+    localizer = make_localizer(scene_map, {0: weak_view(2)}, options)
+    alone = localizer.localize(image_of(0), CAMERA)
+    expected = localizer.localize(
+        image_of(0), CAMERA, Prior(expectation=Expectation(query_pose(2), 0.3, 5.0))
+    )
+    assert alone.accepted
+    assert expected.estimate.belief > alone.estimate.belief
+    strict = replace(options.verdict, min_belief=(alone.estimate.belief + 1.0) / 2.0)
+    localizer = localizer.with_options(replace(options, verdict=strict))
+    assert localizer.localize(image_of(0), CAMERA).status is Status.CONTRADICTED
+    assert localizer.localize(
+        image_of(0), CAMERA, Prior(expectation=Expectation(query_pose(2), 0.3, 5.0))
+    ).accepted
+
+
+def test_a_wrong_expectation_changes_nothing(scene_map: SceneMap) -> None:
+    localizer = make_localizer(scene_map, {0: features_of(PLACE, query_pose(1), seed=1)})
+    alone = localizer.localize(image_of(0), CAMERA)
+    elsewhere = Prior(expectation=Expectation(query_pose(5), 0.3, 5.0))
+    misled = localizer.localize(image_of(0), CAMERA, elsewhere)
+    assert replace(misled, estimate=None, timings=None) == (
+        replace(alone, estimate=None, timings=None)
+    )
+    assert misled.estimate.belief == alone.estimate.belief

@@ -178,7 +178,8 @@ def test_refuses_an_image_that_is_more_like_the_map_when_mirrored() -> None:
 def test_refuses_a_pose_whose_inliers_look_like_another_place() -> None:
     elsewhere, here = rival(3.0, 0.0).camera_from_map, rival(0.2, 3.0).camera_from_map
     many, few = MAX_LOOK_ALIKE_SHARE + 0.01, MAX_LOOK_ALIKE_SHARE - 0.01
-    assert judge_look_alike(GOOD, LookAlike(elsewhere, 100, many), POINTS).status is Status.AMBIGUOUS
+    verdict = judge_look_alike(GOOD, LookAlike(elsewhere, 100, many), POINTS)
+    assert verdict.status is Status.AMBIGUOUS
     assert judge_look_alike(GOOD, LookAlike(elsewhere, 100, few), POINTS) is None
     assert judge_look_alike(GOOD, LookAlike(elsewhere, 7, many), POINTS) is None
     assert judge_look_alike(GOOD, LookAlike(here, 100, 1.0), POINTS) is None
