@@ -46,6 +46,7 @@ from gam_relocalizer.evaluation.adversaries import (
 )
 from gam_relocalizer.evaluation.calibration import (
     calibrate,
+    normalised_error_squared,
     precision_recall,
     precision_recall_figure,
     reliability_figure,
@@ -54,7 +55,7 @@ from gam_relocalizer.evaluation.calibration import (
 )
 from gam_relocalizer.evaluation.metrics import CORRECT
 from gam_relocalizer.features.registry import create_extractor
-from gam_relocalizer.geometry import pose_error, rotation_of, write_text
+from gam_relocalizer.geometry import pose_error, write_text
 from gam_relocalizer.images import read_image
 from gam_relocalizer.localization.localizer import Localizer
 from gam_relocalizer.localization.result import Status
@@ -67,7 +68,7 @@ if TYPE_CHECKING:
     from adversarial_queries import Job
 
     from gam_relocalizer.features.local import LocalExtractor
-    from gam_relocalizer.localization.result import LocalizationResult, PoseEstimate
+    from gam_relocalizer.localization.result import LocalizationResult
     from gam_relocalizer.matching.matcher import Matcher
     from gam_relocalizer.scene_map import SceneMap
 
@@ -323,16 +324,8 @@ def _record(
         is_correct=CORRECT.admits(error),
         error_position=error.position,
         error_rotation_deg=error.rotation_deg,
-        nees=_nees(estimate, truth),
+        nees=normalised_error_squared(estimate.camera_from_map, truth, estimate.covariance),
     )
-
-
-def _nees(estimate: PoseEstimate, truth: pycolmap.Rigid3d) -> float:
-    """e^T P^-1 e of the camera's pose in the map, in the order of REP-103."""
-    estimated, true = estimate.camera_from_map.inverse(), truth.inverse()
-    turned = (rotation_of(estimated) * rotation_of(true).inv()).as_rotvec()
-    error = np.concatenate([estimated.translation - true.translation, turned])
-    return float(error @ np.linalg.solve(estimate.covariance, error))
 
 
 def _report(records: Sequence[Record], out: Path) -> str:

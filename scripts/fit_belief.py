@@ -4,6 +4,7 @@
 
 Renders rooms that are neither those of the demo nor of any benchmark, maps them, and localizes
 views from anywhere, in scene after scene: those that fit give right poses, the others wrong ones.
+Then holds the covariance of the poses that are believed against their errors.
 
     python scripts/fit_belief.py [FOLDER]
 """
@@ -11,6 +12,7 @@ views from anywhere, in scene after scene: those that fit give right poses, the 
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -24,6 +26,7 @@ from gam_relocalizer.demo.adversarial_worlds import random_views
 from gam_relocalizer.demo.recording import drive_appearance, record_mapping_pass, robot_camera
 from gam_relocalizer.demo.renderer import Renderer
 from gam_relocalizer.demo.world import demo_world
+from gam_relocalizer.evaluation.calibration import normalised_error_squared, summarise_nees
 from gam_relocalizer.evaluation.metrics import Threshold
 from gam_relocalizer.features.registry import create_extractor, global_descriptor_of
 from gam_relocalizer.geometry import pose_error, read_poses, write_poses
@@ -45,18 +48,34 @@ SHRINKAGE = 2e-3
 OPTIONS = LocalizerOptions(enough_inliers=10**9, verdict=VerdictOptions(min_belief=0.0))
 
 
+@dataclass(frozen=True)
+class Found:
+    """A pose that passes all checks but the belief."""
+
+    terms: np.ndarray
+    belief: float
+    is_right: bool
+    nees: float
+
+
 def main() -> None:
     """Renders and maps what is missing in the folder, then fits."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path('build/belief')
     torch.set_num_threads(1)
-    rows: list[tuple[np.ndarray, bool]] = []
+    found: list[Found] = []
     for seed in SEEDS:
         _prepare(folder / str(seed), seed)
-        rows += _poses_in(folder / str(seed))
-    terms, right = np.array([row for row, _ in rows]), np.array([row for _, row in rows])
-    belief = _fitted(terms, right)
+        found += _poses_in(folder / str(seed))
+    right = np.array([one.is_right for one in found])
+    belief = _fitted(np.array([one.terms for one in found]), right)
     print(f'{np.count_nonzero(right)} right and {np.count_nonzero(~right)} wrong poses')
     print(f'BELIEF = np.array([{", ".join(f"{weight:.3g}" for weight in belief)}])')
+    believed = [one for one in found if one.is_right and one.belief >= VerdictOptions().min_belief]
+    nees = summarise_nees([one.nees for one in believed])
+    print(
+        f'{nees.trials} believed and right: NEES {nees.mean:.2f}, 95 % band {nees.band[0]:.2f} to '
+        f'{nees.band[1]:.2f}, within 95 %: {nees.within:.1%}, worst {nees.worst_sigma:.1f} sigma'
+    )
 
 
 def _prepare(folder: Path, seed: int) -> None:
@@ -88,12 +107,12 @@ def _prepare(folder: Path, seed: int) -> None:
     )
 
 
-def _poses_in(folder: Path) -> list[tuple[np.ndarray, bool]]:
-    """What speaks for each pose that passes all other checks, and whether it is right."""
+def _poses_in(folder: Path) -> list[Found]:
+    """All poses that pass the other checks."""
     localizer = Localizer.load(folder / 'map', OPTIONS)
     extractor = create_extractor('xfeat')
     describer = global_descriptor_of(localizer.scene_map, None)
-    camera, rows = robot_camera(), []
+    camera, found = robot_camera(), []
     for name, truth in track(read_poses(folder / 'poses_query.txt').items(), f'{folder.name}'):
         image = read_image(folder / 'query' / name)
         features = extractor.extract(image)
@@ -105,8 +124,17 @@ def _poses_in(folder: Path) -> list[tuple[np.ndarray, bool]]:
             residual = scaled_residual(estimate.reprojection_error, camera.width)
             evidence = Evidence(estimate.coverage, residual, estimate.support.unmatched)
             error = pose_error(estimate.camera_from_map, truth)
-            rows.append((evidence.terms, RIGHT.admits(error)))
-    return rows
+            found.append(
+                Found(
+                    terms=evidence.terms,
+                    belief=estimate.belief,
+                    is_right=RIGHT.admits(error),
+                    nees=normalised_error_squared(
+                        estimate.camera_from_map, truth, estimate.covariance
+                    ),
+                )
+            )
+    return found
 
 
 def _fitted(terms: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -11,9 +11,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
+from gam_relocalizer.geometry import rotation_of
+
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import pycolmap
     from numpy.typing import ArrayLike, NDArray
 
 BINS = 10
@@ -152,6 +155,22 @@ def precision_recall(confidence: ArrayLike, correct: ArrayLike, answerable: int)
     accepted = np.array([np.count_nonzero(confidences >= one) for one in thresholds])
     right = np.array([np.count_nonzero(outcomes[confidences >= one]) for one in thresholds])
     return PrecisionRecall(thresholds, right / np.maximum(accepted, 1), right / max(answerable, 1))
+
+
+def normalised_error_squared(
+    estimated: pycolmap.Rigid3d, truth: pycolmap.Rigid3d, covariance: NDArray[np.float64]
+) -> float:
+    """e^T P^-1 e of the camera's pose in the map, in the order of REP-103.
+
+    Args:
+        estimated: `camera_from_map`.
+        truth: The true one.
+        covariance: [6,6] of the pose of the camera in the map.
+    """
+    pose, true = estimated.inverse(), truth.inverse()
+    turned = (rotation_of(pose) * rotation_of(true).inv()).as_rotvec()
+    error = np.concatenate([pose.translation - true.translation, turned])
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 def summarise_nees(nees: ArrayLike) -> NeesSummary:

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from gam_relocalizer.cameras import CAMERA_MODELS, undistort
-from gam_relocalizer.geometry import pose_error, rigid3d_from_rotation, rotation_of
+from gam_relocalizer.evaluation.calibration import normalised_error_squared
+from gam_relocalizer.geometry import pose_error, rigid3d_from_rotation
 from gam_relocalizer.localization.covariance import (
     SHARED_DISTANCE,
     SHARED_VARIANCE,
@@ -79,13 +80,6 @@ def estimate(trial: Trial, camera: pycolmap.Camera) -> AbsolutePose:
     return pose
 
 
-def normalised_error_squared(pose: AbsolutePose, truth: pycolmap.Rigid3d) -> float:
-    estimated, true = pose.camera_from_map.inverse(), truth.inverse()
-    turn = (rotation_of(estimated) * rotation_of(true).inv()).as_rotvec()
-    error = np.concatenate([estimated.translation - true.translation, turn])
-    return float(error @ np.linalg.solve(pose.covariance, error))
-
-
 def drawn_from_the_noise_model(camera: pycolmap.Camera, seed: int) -> tuple[Trial, np.ndarray]:
     """A trial whose keypoints and points err as `pose_covariance` says, and C of the points.
 
@@ -125,7 +119,11 @@ def test_covariance_tells_the_true_spread(camera: pycolmap.Camera) -> None:
             trial.keypoints, trial.points, trial.weights, camera, covariances=covariances
         )
         assert pose is not None
-        errors.append(normalised_error_squared(pose, trial.camera_from_map))
+        errors.append(
+            normalised_error_squared(
+                pose.camera_from_map, trial.camera_from_map, pose.covariance
+            )
+        )
     low, high = chi2.ppf([0.025, 0.975], 6 * trials) / trials
     assert low <= np.mean(errors) <= high
     assert max(errors) < 10.0**2
