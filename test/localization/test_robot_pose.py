@@ -42,7 +42,7 @@ def make_estimate(camera_from_map: pycolmap.Rigid3d, covariance: np.ndarray) -> 
         coverage=1.0,
         reprojection_error=1.0,
         support=Support(in_view=500, unmatched=0.1),
-        belief=0.95,
+        belief=0.99,
     )
 
 

@@ -51,7 +51,7 @@ def result_with(inliers: int) -> LocalizationResult:
         coverage=1.0,
         reprojection_error=1.0,
         support=Support(in_view=500, unmatched=0.1),
-        belief=0.95,
+        belief=0.99,
     )
     return LocalizationResult(Status.ACCEPTED if inliers else Status.NO_POSE, estimate=estimate)
 

@@ -50,7 +50,7 @@ GOOD = PoseEstimate(
     coverage=0.5,
     reprojection_error=1.2,
     support=Support(in_view=500, unmatched=0.1),
-    belief=0.95,
+    belief=0.99,
 )
 
 
@@ -257,6 +257,6 @@ def test_random_matches_are_never_accepted(count: int) -> None:
             coverage=coverage_of(keypoints[pose.inliers], CAMERA),
             reprojection_error=1.0,
             support=Support(in_view=500, unmatched=0.1),
-            belief=0.95,
+            belief=0.99,
         )
         assert judge(estimate, points[pose.inliers], 1.0, OPTIONS).status is not Status.ACCEPTED

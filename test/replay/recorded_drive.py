@@ -109,7 +109,7 @@ def estimate_at(index: int, camera: pycolmap.Camera, points: NDArray[np.float64]
         coverage=0.6,
         reprojection_error=0.4,
         support=Support(in_view=500, unmatched=0.1),
-        belief=0.95,
+        belief=0.99,
     )
 
 

@@ -154,7 +154,7 @@ def test_a_status_survives_the_wire() -> None:
         coverage=np.float32(0.25),
         reprojection_error=1.5,
         support=Support(in_view=500, unmatched=0.1),
-        belief=0.95,
+        belief=0.99,
     )
     result = LocalizationResult(
         Status.LOW_INLIER_RATIO,
