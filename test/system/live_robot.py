@@ -50,6 +50,7 @@ T = TypeVar('T')
 REPOSITORY = Path(__file__).parents[2]
 NODE = '/gam_relocalizer'
 LIMIT_S = 60.0
+PATIENCE_S = 5.0
 QUICK = {
     'period': 0.05,
     'image_reliability': 'reliable',
@@ -205,11 +206,14 @@ class Robot:
         )
 
     def change_state(self, transition: int) -> bool:
+        self.state()  # so that the two ends have found each other: this must not be asked twice
         request = ChangeState.Request(transition=Transition(id=transition))
-        return bool(self._call(ChangeState, f'{NODE}/change_state', request).success)
+        answer = self._call(ChangeState, f'{NODE}/change_state', request, patience=LIMIT_S)
+        return bool(answer.success)
 
     def request_state(self, transition: int) -> None:
         """As `change_state`, for a request that gets no answer."""
+        self.state()
         client = self.node.create_client(ChangeState, f'{NODE}/change_state')
         assert client.wait_for_service(LIMIT_S)
         client.call_async(ChangeState.Request(transition=Transition(id=transition)))
@@ -225,11 +229,21 @@ class Robot:
         result = self._call(SetParameters, f'{NODE}/set_parameters', request).results[0]
         return bool(result.successful), str(result.reason)
 
-    def _call(self, kind: type, name: str, request: object) -> Any:  # noqa: ANN401 - a response
+    def _call(self, kind: type, name: str, request: object, patience: float = PATIENCE_S) -> Any:  # noqa: ANN401 - a response
+        """The answer; asked again, as DDS can lose a request while both ends find each other."""
         client = self.node.create_client(kind, name)
         assert client.wait_for_service(LIMIT_S), name
-        future = client.call_async(request)
-        wait_for(future.done, name)
+        asked = time.monotonic()
+        futures = [client.call_async(request)]
+
+        def answered() -> Any:  # noqa: ANN401
+            nonlocal asked
+            if time.monotonic() > asked + patience:
+                asked = time.monotonic()
+                futures.append(client.call_async(request))
+            return next((future for future in futures if future.done()), None)
+
+        future = wait_for(answered, name)
         self.node.destroy_client(client)
         return future.result()
 
