@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 
 from gam_relocalizer.geometry import rotation_of
+from gam_relocalizer.localization.correction import Correction, correction_by
 from gam_relocalizer.localization.odometry import (
     DEFAULT_DRIFT,
     SIGMAS,
@@ -86,6 +87,28 @@ class Continuity:
         self._gate = OdometryGate()
         self._place: _Place | None = None
         self._suggested: RobotPose | None = None
+        self._correction: Correction | None = None
+
+    @property
+    def correction(self) -> Correction | None:
+        """Where the odometry's frame lies in the map, by the newest fix that another one confirms.
+
+        That is one that passed and agrees with another one by the odometry between them: the last
+        one that passed, or one held back. So neither a wrong first fix, which passes because there
+        is nothing to compare it with, nor any other single one ever moves it. The pose is what
+        these fixes make of each other (`odometry.fused`). A robot that stands still gets its
+        correction from two fixes of one view, which may both be wrong: it may have to know where
+        it is before it can move.
+
+        It stays while fixes are held back, refused, or come without odometry at their stamps.
+
+        None before that; while odometry is doubted; from a gap or a jump in the odometry on
+        (`OdometryTrack.unbroken_since_ns`) until such a fix after it; on a map that is not metric.
+        """
+        correction = self._correction
+        if correction is None or correction.stamp_ns < self._track.unbroken_since_ns:
+            return None
+        return correction
 
     def add_odometry(self, stamp_ns: int, odom_from_base: pycolmap.Rigid3d) -> None:
         """Takes in one sample of odometry; when its stamps jump back, all starts anew.
@@ -153,6 +176,8 @@ class Continuity:
                     f'fix, by {against}; held back until another one confirms it'
                 )
                 return result.judged(Status.IMPLAUSIBLE, reason)
+            agreed = self._gate.agreed
+            self._correction = None if agreed is None else correction_by(agreed, stamp_ns)
         self._place = _Place(stamp_ns, pose, odometry, is_fix=True)
         return result
 
@@ -171,6 +196,7 @@ class Continuity:
         self._gate.clear()
         self._place = None
         self._suggested = None
+        self._correction = None
 
     def _hint(
         self, stamp_ns: int, base_from_camera: pycolmap.Rigid3d | None

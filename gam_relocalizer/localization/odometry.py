@@ -15,14 +15,22 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from gam_relocalizer.geometry import PoseError, pose_error
+from gam_relocalizer.geometry import (
+    PoseError,
+    pose_error,
+    rigid3d_from_rotation,
+    rotation_of,
+    skew,
+    symmetric,
+)
+from gam_relocalizer.localization.robot_pose import RobotPose
 from gam_relocalizer.transforms import interpolated
 
 if TYPE_CHECKING:
     import pycolmap
-
-    from gam_relocalizer.localization.robot_pose import RobotPose
+    from numpy.typing import NDArray
 
 # Odometry is asked for the stamp of an image when the attempt is over: longer than that takes.
 HISTORY_NS = 30 * 10**9
@@ -32,6 +40,9 @@ HOLD_NS = 50 * 10**6
 MAX_GAP_NS = 10**9
 # A sample this much older than the last one is no straggler: time has jumped back.
 RESTART_NS = 10**9
+# No robot is that quick [m/s, deg/s]: odometry that is has jumped, as when it restarts at zero.
+JUMP_SPEED = 20.0
+JUMP_TURN_RATE = 720.0
 
 # Odometry that trembles where the robot stands is no way travelled.
 STRIDE = 0.05
@@ -75,6 +86,16 @@ class OdometryTrack:
         self._stamps: list[int] = []
         self._readings: list[OdometryReading] = []
         self._stride: OdometryReading | None = None
+        self._unbroken_since_ns = 0
+
+    @property
+    def unbroken_since_ns(self) -> int:
+        """From when on odometry counts from where it counts now [ns].
+
+        After more than `MAX_GAP_NS` without samples it may have been started anew, and after a step
+        that no robot makes in the time it has been.
+        """
+        return self._unbroken_since_ns
 
     @property
     def is_empty(self) -> bool:
@@ -96,6 +117,8 @@ class OdometryTrack:
             self.clear()
         if self._stamps and stamp_ns <= self._stamps[-1]:
             return
+        if self._stamps and self._breaks_off(stamp_ns, odom_from_base):
+            self._unbroken_since_ns = stamp_ns
         self._stamps.append(stamp_ns)
         self._readings.append(self._measured(odom_from_base))
         expired = bisect_left(self._stamps, stamp_ns - self._history_ns)
@@ -125,13 +148,24 @@ class OdometryTrack:
         self._stamps.clear()
         self._readings.clear()
         self._stride = None
+        self._unbroken_since_ns = 0
+
+    def _breaks_off(self, stamp_ns: int, odom_from_base: pycolmap.Rigid3d) -> bool:
+        """Whether a new sample is not the last one, moved on."""
+        elapsed_ns = stamp_ns - self._stamps[-1]
+        moved = _moved(self._readings[-1].odom_from_base, odom_from_base)
+        return (
+            elapsed_ns > MAX_GAP_NS
+            or moved.position > POSITION_FLOOR + JUMP_SPEED * elapsed_ns / 1e9
+            or moved.rotation_deg > ROTATION_FLOOR_DEG + JUMP_TURN_RATE * elapsed_ns / 1e9
+        )
 
     def _measured(self, odom_from_base: pycolmap.Rigid3d) -> OdometryReading:
         """A sample with the way to it, in strides: so small steps that they may be noise wait."""
         if self._stride is None:
             self._stride = OdometryReading(odom_from_base, 0.0, 0.0)
         stride = self._stride
-        moved = pose_error(odom_from_base.inverse(), stride.odom_from_base.inverse())
+        moved = _moved(stride.odom_from_base, odom_from_base)
         if moved.position < STRIDE and moved.rotation_deg < STRIDE_DEG:
             return OdometryReading(odom_from_base, stride.travelled, stride.turned_deg)
         self._stride = OdometryReading(
@@ -150,6 +184,15 @@ class OdometryTrack:
         return OdometryReading(odom_from_base, earlier.travelled, earlier.turned_deg)
 
 
+def _moved(before: pycolmap.Rigid3d, after: pycolmap.Rigid3d) -> PoseError:
+    """As `pose_error`, and quicker: it is asked for every sample."""
+    before_from_after = before.inverse() * after
+    return PoseError(
+        float(np.linalg.norm(before_from_after.translation)),
+        math.degrees(before_from_after.rotation.angle()),
+    )
+
+
 @dataclass(frozen=True)
 class Fix:
     """A fix, with the odometry at the same time."""
@@ -165,10 +208,12 @@ class Prediction:
     Attributes:
         map_from_base: The pose.
         margin: How far off it may be.
+        covariance: [6,6], order of REP-103.
     """
 
     map_from_base: pycolmap.Rigid3d
     margin: PoseError
+    covariance: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -195,7 +240,8 @@ def predict(fix: Fix, odometry: OdometryReading, drift: float) -> Prediction:
 
     The margin of the position is `POSITION_FLOOR`, 3 sigma of the fix (its orientation swings the
     way since), and the drift's share of the way. That of the rotation is `ROTATION_FLOOR_DEG`,
-    3 sigma, and the drift's share of the turns and of the way (see `METRES_PER_RADIAN`).
+    3 sigma, and the drift's share of the turns and of the way (see `METRES_PER_RADIAN`). The
+    covariance is that of the fix, carried on, and the same shares as standard deviations.
 
     Args:
         fix: From where.
@@ -203,19 +249,59 @@ def predict(fix: Fix, odometry: OdometryReading, drift: float) -> Prediction:
         drift: Share of the way, and of the turns, that odometry may be off.
     """
     base_before_from_base = fix.odometry.odom_from_base.inverse() * odometry.odom_from_base
+    map_from_base = fix.pose.map_from_base * base_before_from_base
     travelled = abs(odometry.travelled - fix.odometry.travelled)
     turned_deg = abs(odometry.turned_deg - fix.odometry.turned_deg)
+    drifted = PoseError(
+        drift * travelled, drift * (turned_deg + math.degrees(travelled / METRES_PER_RADIAN))
+    )
     position_std, rotation_std = _deviations(fix.pose)
     swing = rotation_std * float(np.linalg.norm(base_before_from_base.translation))
     return Prediction(
-        fix.pose.map_from_base * base_before_from_base,
+        map_from_base,
         PoseError(
-            POSITION_FLOOR + SIGMAS * math.hypot(position_std, swing) + drift * travelled,
-            ROTATION_FLOOR_DEG
-            + SIGMAS * math.degrees(rotation_std)
-            + drift * (turned_deg + math.degrees(travelled / METRES_PER_RADIAN)),
+            POSITION_FLOOR + SIGMAS * math.hypot(position_std, swing) + drifted.position,
+            ROTATION_FLOOR_DEG + SIGMAS * math.degrees(rotation_std) + drifted.rotation_deg,
         ),
+        _carried_on(fix.pose, map_from_base, drifted),
     )
+
+
+def _carried_on(
+    pose: RobotPose, map_from_base: pycolmap.Rigid3d, drifted: PoseError
+) -> NDArray[np.float64]:
+    """Covariance of a pose after a motion that may be off; its orientation swings the way."""
+    jacobian = np.eye(6)
+    jacobian[:3, 3:] = -skew(map_from_base.translation - pose.map_from_base.translation)
+    std = np.repeat([drifted.position, math.radians(drifted.rotation_deg)], 3)
+    return symmetric(jacobian @ pose.covariance @ jacobian.T + np.diag(np.square(std)))
+
+
+def fused(before: Fix, fix: Fix, drift: float) -> Fix:
+    """What a fix and the one before make of each other: the better one counts for more.
+
+    The update of a Kalman filter. A precise fix is hardly changed; one of a far wall, which is off
+    by many centimetres and says so, hardly changes what is known.
+
+    Args:
+        before: The earlier fix.
+        fix: A later one that agrees with it.
+        drift: See `predict`.
+
+    Returns:
+        The better pose at the time of the later one.
+    """
+    prediction = predict(before, fix.odometry, drift)
+    predicted, found = prediction.map_from_base, fix.pose.map_from_base
+    turned = rotation_of(found) * rotation_of(predicted).inv()
+    moved = np.concatenate([found.translation - predicted.translation, turned.as_rotvec()])
+    gain = np.linalg.solve(prediction.covariance + fix.pose.covariance, prediction.covariance).T
+    step = gain @ moved
+    map_from_base = rigid3d_from_rotation(
+        Rotation.from_rotvec(step[3:]) * rotation_of(predicted), predicted.translation + step[:3]
+    )
+    covariance = symmetric(gain @ fix.pose.covariance)
+    return Fix(RobotPose(map_from_base, covariance), fix.odometry)
 
 
 def disagreement(before: Fix, fix: Fix, drift: float) -> Disagreement | None:
@@ -245,7 +331,8 @@ class OdometryGate:
     """Holds back fixes that disagree with the odometry, until they are confirmed.
 
     - The first fix passes: there is nothing to compare it with.
-    - A fix that agrees with the last one that passed, passes.
+    - A fix that agrees with the last one that passed, passes. The last one is what all that agreed
+      make of each other (`fused`).
     - One that does not is held back. When one of the next two agrees with it, that one passes, and
       the new place counts (2 of the last 3): the robot has been carried, or the earlier fix was
       wrong. So one wrong fix never makes the robot jump.
@@ -258,11 +345,20 @@ class OdometryGate:
         self._last: Fix | None = None
         self._held: deque[Fix] = deque(maxlen=DOUBT_AFTER)
         self._doubted = False
+        self._agreed = False
 
     @property
     def doubts_odometry(self) -> bool:
         """Whether fixes pass although they disagree."""
         return self._doubted
+
+    @property
+    def agreed(self) -> Fix | None:
+        """What the fixes that agree make of each other, at the time of the last one that passed.
+
+        None when that one agreed with no other, as the first one.
+        """
+        return self._last if self._agreed else None
 
     def judge(self, fix: Fix, drift: float) -> Disagreement | None:
         """Lets a fix pass or holds it back.
@@ -278,8 +374,10 @@ class OdometryGate:
             self._pass(fix)
             return None
         against = disagreement(self._last, fix, drift)
-        if against is None or self._is_confirmed(fix, drift):
-            self._pass(fix)
+        fellow = self._last if against is None else self._confirming(fix, drift)
+        if fellow is not None:
+            self._pass(fused(fellow, fix, drift))
+            self._agreed = True
             return None
         if self._doubted or len(self._held) == DOUBT_AFTER:
             self._pass(fix)
@@ -293,15 +391,18 @@ class OdometryGate:
         self._last = None
         self._held.clear()
         self._doubted = False
+        self._agreed = False
 
-    def _is_confirmed(self, fix: Fix, drift: float) -> bool:
+    def _confirming(self, fix: Fix, drift: float) -> Fix | None:
+        """One that was held back and agrees."""
         recent = list(self._held)[-RECENTLY_HELD:]
-        return any(disagreement(held, fix, drift) is None for held in recent)
+        return next((held for held in recent if disagreement(held, fix, drift) is None), None)
 
     def _pass(self, fix: Fix) -> None:
         self._last = fix
         self._held.clear()
         self._doubted = False
+        self._agreed = False
 
 
 def _deviations(pose: RobotPose) -> tuple[float, float]:

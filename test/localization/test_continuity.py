@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gam_relocalizer.geometry import rigid3d_from, rigid3d_from_rotation
+from gam_relocalizer.geometry import pose_error, rigid3d_from, rigid3d_from_rotation
 from gam_relocalizer.localization.continuity import (
     MAX_SPEED,
     MIN_HINT_RADIUS,
@@ -20,14 +20,20 @@ from gam_relocalizer.localization.continuity import (
     ContinuityOptions,
     is_odometry_of,
 )
+from gam_relocalizer.localization.odometry import DOUBT_AFTER, JUMP_SPEED, MAX_GAP_NS
 from gam_relocalizer.localization.prior import PositionHint, Prior
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import RobotPose
 
 if TYPE_CHECKING:
+    from random import Random
+
     import pycolmap
 
+    from gam_relocalizer.localization.correction import Correction
+
 SECOND = 10**9
+EXAMPLES = settings(max_examples=50, deadline=None)
 ACCEPTED = LocalizationResult(Status.ACCEPTED, 'good')
 # optical frame (z forward, y down) at the height of a head, looking along the base's x axis
 BASE_FROM_CAMERA = rigid3d_from((0.5, -0.5, 0.5, -0.5), (0.2, 0.0, 1.5))
@@ -243,3 +249,243 @@ def test_odometry_over_a_long_way_makes_nothing_expected() -> None:
     fix(continuity, 0.0, planar(0.0, 0.0))
     assert continuity.prior(2 * SECOND, BASE_FROM_CAMERA).expectation is not None
     assert continuity.prior(19 * SECOND, BASE_FROM_CAMERA).expectation is None
+
+
+ODOM_FROM_START = planar(5.0, 5.0, 90.0)
+MAP_FROM_START = planar(-3.0, 1.0, 30.0)
+MAP_FROM_ODOM = MAP_FROM_START * ODOM_FROM_START.inverse()
+SPEED = 0.5
+
+
+def way(second: float) -> pycolmap.Rigid3d:
+    """How far a straight drive has come."""
+    return planar(SPEED * second, 0.0)
+
+
+def driving(first: int = 0, last: int = 20) -> Continuity:
+    """Odometry without drift; `MAP_FROM_ODOM` is what lays it on the true way."""
+    continuity = Continuity()
+    feed(continuity, first, last, ODOM_FROM_START)
+    return continuity
+
+
+def feed(
+    continuity: Continuity, first: float, last: float, odom_from_start: pycolmap.Rigid3d
+) -> None:
+    for tenth in range(round(10 * first), round(10 * last) + 1):
+        continuity.add_odometry(tenth * SECOND // 10, odom_from_start * way(tenth / 10.0))
+
+
+def true_fix(continuity: Continuity, second: float) -> Status:
+    return fix(continuity, second, MAP_FROM_START * way(second))
+
+
+def wrong_fix(
+    continuity: Continuity, second: float, shift: pycolmap.Rigid3d | None = None
+) -> Status:
+    return fix(continuity, second, (shift or planar(8.0, 9.0, 70.0)) * MAP_FROM_START * way(second))
+
+
+def assert_lays(
+    correction: Correction | None, map_from_odom: pycolmap.Rigid3d, second: float
+) -> None:
+    assert correction is not None
+    error = pose_error(correction.map_from_odom.inverse(), map_from_odom.inverse())
+    assert error.position < 1e-9
+    assert error.rotation_deg < 1e-5
+    assert correction.stamp_ns == round(second * SECOND)
+
+
+@EXAMPLES
+@given(st.tuples(*[st.floats(-50.0, 50.0)] * 3), st.floats(0.0, 9.0), st.floats(0.1, 9.0))
+def test_the_correction_lays_the_odometry_at_the_stamp_of_the_image_on_the_fix(
+    start: tuple[float, float, float], first: float, later: float
+) -> None:
+    """Between two samples of the odometry, wherever it counts from."""
+    continuity = Continuity()
+    odom_from_start = planar(*start)
+    feed(continuity, 0.0, 20.0, odom_from_start)
+    true_fix(continuity, first)
+    true_fix(continuity, first + later)
+    assert_lays(continuity.correction, MAP_FROM_START * odom_from_start.inverse(), first + later)
+
+
+def test_a_fix_that_no_other_one_agrees_with_corrects_nothing() -> None:
+    continuity = driving()
+    assert continuity.correction is None
+    assert true_fix(continuity, 1.0) is Status.ACCEPTED
+    assert continuity.correction is None
+
+
+def test_a_wrong_first_fix_never_corrects() -> None:
+    continuity = driving()
+    assert wrong_fix(continuity, 1.0) is Status.ACCEPTED
+    assert true_fix(continuity, 3.0) is Status.IMPLAUSIBLE
+    assert continuity.correction is None
+    assert true_fix(continuity, 5.0) is Status.ACCEPTED
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 5.0)
+
+
+@EXAMPLES
+@given(st.lists(st.booleans(), max_size=12), st.randoms(use_true_random=False))
+def test_single_wrong_fixes_never_move_the_correction(wanted: list[bool], random: Random) -> None:
+    """Wrong ones anywhere, each followed by two good ones, the very first included."""
+    continuity = driving()
+    wrong = [False] * (len(wanted) + 2)
+    for index, is_wrong in enumerate(wanted):
+        wrong[index] = is_wrong and not any(wrong[max(0, index - 2) : index])
+    for index, is_wrong in enumerate(wrong):
+        if is_wrong:
+            shift = planar(random.uniform(3.0, 50.0), random.uniform(3.0, 50.0))
+            wrong_fix(continuity, float(index), shift)
+        else:
+            true_fix(continuity, float(index))
+        if continuity.correction is not None:
+            newest = continuity.correction.stamp_ns / SECOND
+            assert_lays(continuity.correction, MAP_FROM_ODOM, newest)
+            assert not wrong[round(newest)]
+    assert continuity.correction is not None
+
+
+def test_a_correction_stays_while_a_fix_is_held_back() -> None:
+    continuity = driving()
+    true_fix(continuity, 1.0)
+    true_fix(continuity, 2.0)
+    assert wrong_fix(continuity, 3.0) is Status.IMPLAUSIBLE
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 2.0)
+
+
+def test_a_fix_that_says_that_it_is_poor_hardly_moves_the_correction() -> None:
+    """A far wall tells the distance to it badly."""
+    continuity = driving()
+    true_fix(continuity, 1.0)
+    true_fix(continuity, 2.0)
+    place = MAP_FROM_START * way(3.0)
+    poor = robot_at(planar(0.3, 0.0) * place, std=0.2)
+    assert continuity.judge(3 * SECOND, ACCEPTED, poor).status is Status.ACCEPTED
+    assert continuity.correction is not None
+    found = continuity.correction.map_from_odom * ODOM_FROM_START * way(3.0)
+    assert 0.0 < pose_error(found.inverse(), place.inverse()).position < 0.03
+
+
+def test_a_carried_robot_is_corrected_by_the_second_fix_of_the_new_place() -> None:
+    continuity = driving()
+    elsewhere = planar(20.0, 0.0, 45.0)
+    true_fix(continuity, 1.0)
+    true_fix(continuity, 2.0)
+    wrong_fix(continuity, 3.0, elsewhere)
+    wrong_fix(continuity, 4.0, elsewhere)
+    assert_lays(continuity.correction, elsewhere * MAP_FROM_ODOM, 4.0)
+
+
+def test_there_is_no_correction_while_odometry_is_doubted() -> None:
+    continuity = driving()
+    true_fix(continuity, 0.0)
+    true_fix(continuity, 1.0)
+    for index in range(2, DOUBT_AFTER + 2):
+        assert wrong_fix(continuity, float(index), planar(10.0 * index, 0.0)) is Status.IMPLAUSIBLE
+        assert_lays(continuity.correction, MAP_FROM_ODOM, 1.0)
+    assert wrong_fix(continuity, 8.0, planar(90.0, 0.0)) is Status.ACCEPTED
+    assert continuity.doubts_odometry
+    assert continuity.correction is None
+    true_fix(continuity, 9.0)
+    assert continuity.correction is None
+    true_fix(continuity, 10.0)
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 10.0)
+
+
+def test_odometry_that_restarts_at_zero_has_no_correction_until_two_fixes_agree_by_it() -> None:
+    """In the middle of a drive, without a jump in time: what was right before is wrong at once."""
+    continuity = driving(0, 10)
+    true_fix(continuity, 8.0)
+    true_fix(continuity, 9.0)
+    odom_from_start = planar(SPEED * 10.1, 0.0).inverse()
+    feed(continuity, 10.1, 20.0, odom_from_start)
+    assert continuity.correction is None
+    # its image was taken before, and counts for what was counted then
+    true_fix(continuity, 10.0)
+    assert continuity.correction is None
+    true_fix(continuity, 11.0)
+    assert continuity.correction is None
+    true_fix(continuity, 12.0)
+    assert_lays(continuity.correction, MAP_FROM_START * odom_from_start.inverse(), 12.0)
+
+
+def test_after_a_gap_in_the_odometry_a_fix_has_to_confirm_the_correction() -> None:
+    continuity = driving(0, 10)
+    true_fix(continuity, 8.0)
+    true_fix(continuity, 9.0)
+    feed(continuity, 10.0 + MAX_GAP_NS / SECOND, 12.0, ODOM_FROM_START)
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 9.0)
+    feed(continuity, 12.1 + MAX_GAP_NS / SECOND, 20.0, ODOM_FROM_START)
+    assert continuity.correction is None
+    true_fix(continuity, 15.0)
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 15.0)
+
+
+def test_a_quick_robot_keeps_its_correction() -> None:
+    continuity = Continuity()
+    for tenth in range(51):
+        speed = 0.9 * JUMP_SPEED
+        continuity.add_odometry(tenth * SECOND // 10, planar(speed * tenth / 10.0, 0.0))
+        if tenth in {10, 20}:
+            fix(continuity, tenth / 10.0, planar(speed * tenth / 10.0, 0.0))
+    assert continuity.correction is not None
+
+
+def test_a_fix_without_odometry_at_its_stamp_leaves_the_correction_as_it_is() -> None:
+    continuity = driving(0, 10)
+    assert wrong_fix(continuity, 20.0) is Status.ACCEPTED
+    assert wrong_fix(continuity, 21.0) is Status.ACCEPTED
+    assert continuity.correction is None
+    true_fix(continuity, 8.0)
+    true_fix(continuity, 9.0)
+    assert wrong_fix(continuity, 20.0) is Status.ACCEPTED
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 9.0)
+
+
+def test_a_robot_that_stands_still_is_corrected_as_well() -> None:
+    """It may have to know where it is before it can move."""
+    continuity = Continuity()
+    for tenth in range(100):
+        continuity.add_odometry(tenth * SECOND // 10, ODOM_FROM_START)
+    for second in (1.0, 2.0):
+        fix(continuity, second, MAP_FROM_START)
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 2.0)
+
+
+def test_no_correction_outlives_a_jump_back_in_time() -> None:
+    continuity = driving(100, 120)
+    true_fix(continuity, 101.0)
+    true_fix(continuity, 102.0)
+    assert continuity.correction is not None
+    feed(continuity, 50.0, 50.0, ODOM_FROM_START)
+    assert continuity.correction is None
+
+
+def test_clearing_forgets_the_correction() -> None:
+    continuity = driving()
+    true_fix(continuity, 1.0)
+    true_fix(continuity, 2.0)
+    continuity.clear()
+    assert continuity.correction is None
+    feed(continuity, 0.0, 20.0, ODOM_FROM_START)
+    true_fix(continuity, 3.0)
+    assert continuity.correction is None
+
+
+def test_a_suggestion_corrects_nothing() -> None:
+    continuity = driving()
+    true_fix(continuity, 1.0)
+    true_fix(continuity, 2.0)
+    continuity.suggest(robot_at(planar(50.0, 0.0)))
+    continuity.prior(3 * SECOND, BASE_FROM_CAMERA)
+    assert_lays(continuity.correction, MAP_FROM_ODOM, 2.0)
+
+
+def test_in_a_map_without_metres_there_is_no_correction() -> None:
+    continuity = Continuity(ContinuityOptions(metric=False))
+    feed(continuity, 0.0, 20.0, ODOM_FROM_START)
+    true_fix(continuity, 1.0)
+    true_fix(continuity, 2.0)
+    assert continuity.correction is None

@@ -25,6 +25,7 @@ from gam_relocalizer.localization.odometry import (
     OdometryReading,
     OdometryTrack,
     disagreement,
+    fused,
     predict,
 )
 from gam_relocalizer.localization.robot_pose import RobotPose
@@ -269,6 +270,83 @@ def wrong_places(draw: st.DrawFn) -> pycolmap.Rigid3d:
     """A motion of the map that takes every pose elsewhere."""
     metres, angle = draw(st.floats(3.0, 100.0)), draw(st.floats(0.0, 2.0 * np.pi))
     return planar(metres * np.cos(angle), metres * np.sin(angle), 0.0)
+
+
+def fix_with(map_from_base: pycolmap.Rigid3d, std: float, odometry: OdometryReading) -> Fix:
+    return Fix(RobotPose(map_from_base, np.diag([std**2] * 6)), odometry)
+
+
+@EXAMPLES
+@given(drives())
+def test_two_fixes_are_better_than_either(drive: Drive) -> None:
+    before, fix = drive.fix(0), drive.fix(len(drive) - 1)
+    both = fused(before, fix, DRIFT).pose.covariance
+    prediction = predict(before, fix.odometry, DRIFT)
+    np.testing.assert_array_equal(both, both.T)
+    assert np.linalg.eigvalsh(both).min() > 0.0
+    for alone in (fix.pose.covariance, prediction.covariance):
+        assert np.linalg.eigvalsh(alone - both).min() > -1e-12
+
+
+@EXAMPLES
+@given(drives(), st.tuples(*[st.floats(-180.0, 180.0)] * 3))
+def test_what_two_fixes_make_of_each_other_does_not_depend_on_the_axes_of_the_map(
+    drive: Drive, angles: tuple[float, float, float]
+) -> None:
+    turn = Rotation.from_euler('ZYX', angles, degrees=True)
+    other_from_map = rigid3d_from_rotation(turn, [3.0, -20.0, 1.0])
+    axes = np.kron(np.eye(2), turn.as_matrix())
+
+    def moved(fix: Fix) -> Fix:
+        covariance = axes @ fix.pose.covariance @ axes.T
+        return Fix(RobotPose(other_from_map * fix.pose.map_from_base, covariance), fix.odometry)
+
+    before, fix = drive.fix(0), drive.fix(len(drive) - 1)
+    found = fused(moved(before), moved(fix), DRIFT).pose
+    expected = moved(fused(before, fix, DRIFT)).pose
+    assert_close(found.map_from_base, expected.map_from_base)
+    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-12)
+
+
+def test_of_a_precise_and_a_poor_fix_the_precise_one_counts() -> None:
+    after = OdometryReading(moved_by(0.1), 0.1, 0.0)
+    for std_before, std, x in ((1e-4, 1.0, 0.1), (1.0, 1e-4, 0.3)):
+        start = fix_with(moved_by(0.0), std_before, STANDING)
+        found = fused(start, fix_with(moved_by(0.3), std, after), DRIFT).pose.map_from_base
+        np.testing.assert_allclose(found.translation, [x, 0.0, 0.0], atol=1e-4)
+
+
+def test_odometry_that_may_be_off_further_has_less_of_a_say() -> None:
+    def found_after(metres: float) -> float:
+        after = OdometryReading(moved_by(metres), metres, 0.0)
+        late = fix_with(planar(metres, 0.1, 0.0), 0.03, after)
+        start = fix_with(moved_by(0.0), 0.03, STANDING)
+        return float(fused(start, late, DRIFT).pose.map_from_base.translation[1])
+
+    assert found_after(0.0) == pytest.approx(0.05)
+    assert found_after(0.0) < found_after(1.0) < found_after(5.0) < 0.1
+
+
+def test_fixes_of_a_robot_that_stands_still_are_averaged() -> None:
+    gate, offsets = OdometryGate(), [0.03, -0.02, 0.05, 0.0, -0.01]
+    for offset in offsets:
+        assert (
+            gate.judge(fix_with(planar(offset, -offset, 100.0 * offset), STD, STANDING), DRIFT)
+            is None
+        )
+    assert gate.agreed is not None
+    mean = float(np.mean(offsets))
+    assert_close(gate.agreed.pose.map_from_base, planar(mean, -mean, 100.0 * mean))
+    expected = np.diag([STD**2 / len(offsets)] * 6)
+    np.testing.assert_allclose(gate.agreed.pose.covariance, expected, atol=1e-12)
+
+
+def test_the_first_fix_agrees_with_none_nor_does_one_that_passes_in_doubt() -> None:
+    gate = OdometryGate()
+    for index in range(DOUBT_AFTER + 3):
+        gate.judge(fix_of(moved_by(10.0 * index), STANDING), DRIFT)
+        assert gate.agreed is None
+    assert gate.doubts_odometry
 
 
 def verdicts(gate: OdometryGate, fixes: Sequence[Fix]) -> list[bool]:
