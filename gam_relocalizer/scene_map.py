@@ -139,9 +139,10 @@ class Manifest:
 
     @property
     def map_id(self) -> str:
-        """Short name of exactly this map: it changes with any byte of any file."""
+        """Short name of exactly this map: it changes with any byte of any file, and the frame."""
         sums = ''.join(f'{name}{entry.sha256}' for name, entry in sorted(self.files.items()))
-        return hashlib.sha256(sums.encode()).hexdigest()[:12]
+        frame = f'{self.frame.scale!r}{self.frame.rotation_wxyz!r}{self.frame.translation!r}'
+        return hashlib.sha256(f'{sums}{frame}'.encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True)
