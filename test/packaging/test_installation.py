@@ -66,12 +66,15 @@ def test_share_holds_the_whole_folder(wheel: dict[str, zipfile.ZipInfo], folder:
         assert f'{DATA}/share/gam_relocalizer/{path.relative_to(REPOSITORY)}' in wheel
 
 
-def test_launch_file_finds_what_it_names(wheel: dict[str, zipfile.ZipInfo]) -> None:
-    text = (REPOSITORY / 'launch' / 'relocalizer.launch.py').read_text()
+@pytest.mark.parametrize('name', ['relocalizer', 'replay', 'robot_localization'])
+def test_launch_file_finds_what_it_names(wheel: dict[str, zipfile.ZipInfo], name: str) -> None:
+    text = (REPOSITORY / 'launch' / f'{name}.launch.py').read_text()
 
-    (named,) = re.findall(r"PathJoinSubstitution\(\[share, '(\w+)', '([\w.]+)'\]\)", text)
+    named = re.findall(r"'(config|launch)', '([\w.]+)'", text)
 
-    assert f'{DATA}/share/gam_relocalizer/{"/".join(named)}' in wheel
+    assert named
+    for folder, file in named:
+        assert f'{DATA}/share/gam_relocalizer/{folder}/{file}' in wheel
 
 
 def test_whole_python_package_is_installed(wheel: dict[str, zipfile.ZipInfo]) -> None:

@@ -1,0 +1,83 @@
+# Copyright 2026 gam_relocalizer authors
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A row of the table of topics in docs/ros_interface.md."""
+
+    is_input: bool
+    type: str
+    reliable: bool
+    transient_local: bool
+
+
+class StrictLoader(yaml.SafeLoader):
+    """Refuses a key that is there twice: the first one would be lost without a word."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: FBT001, FBT002 - overrides
+        keys = Counter(self.construct_object(key, deep=deep) for key, _ in node.value)
+        assert not [key for key, count in keys.items() if count > 1], node.start_mark
+        return super().construct_mapping(node, deep=deep)
+
+
+def read_yaml(name: str) -> Any:  # noqa: ANN401 - whatever the file holds
+    text = (REPOSITORY / 'config' / name).read_text(encoding='utf-8')
+    return yaml.load(text, StrictLoader)  # noqa: S506 - a safe loader
+
+
+@pytest.fixture(scope='session')
+def config_folder() -> Path:
+    return REPOSITORY / 'config'
+
+
+@pytest.fixture(scope='session')
+def ekf() -> dict[str, Any]:
+    return read_yaml('ekf.yaml')['/**/ekf_filter_node_map']['ros__parameters']
+
+
+@pytest.fixture(scope='session')
+def fuse() -> dict[str, Any]:
+    return read_yaml('fuse.yaml')['fixed_lag_smoother_node']['ros__parameters']
+
+
+@pytest.fixture(scope='session')
+def rviz() -> dict[str, Any]:
+    return read_yaml('relocalizer.rviz')
+
+
+@pytest.fixture(scope='session')
+def topics() -> dict[str, Topic]:
+    """All topics of a node without a namespace, by their full names."""
+    page = (REPOSITORY / 'docs' / 'ros_interface.md').read_text(encoding='utf-8')
+    rows = re.findall(r'^\| (in|out) \| (.+?) \| (\w+/\w+).*? \| (.+?) \|$', page, re.MULTILINE)
+    found = {
+        full_name(name): Topic(
+            is_input=direction == 'in',
+            type=kind,
+            reliable='best effort' not in qos,
+            transient_local='transient local' in qos,
+        )
+        for direction, names, kind, qos in rows
+        for name in re.findall(r'`([~/\w]+)`', names)
+    }
+    assert len(rows) >= 12
+    return found
+
+
+def full_name(name: str) -> str:
+    if name.startswith('~/'):
+        return f'/gam_relocalizer/{name[2:]}'
+    return name if name.startswith('/') else f'/{name}'
