@@ -38,7 +38,11 @@ def replay(  # noqa: PLR0913 - the options of the command
     ],
     map_path: Annotated[Path, typer.Option('--map', help='Map bundle to localize in.')],
     out: Annotated[
-        Path, typer.Option(help='Folder for poses.tum, fixes.mcap, summary.json and report.html.')
+        Path,
+        typer.Option(
+            help='Folder for poses.tum, fixes.mcap, summary.json and report.html; with odometry '
+            'also for corrected.tum.'
+        ),
     ],
     *,
     period: Annotated[
@@ -52,7 +56,10 @@ def replay(  # noqa: PLR0913 - the options of the command
     ] = None,
     odom_topic: Annotated[
         str | None,
-        typer.Option(help='Odometry of the base; fixes that it speaks against are held back.'),
+        typer.Option(
+            help='Odometry of the base; fixes that it speaks against are held back, and those that '
+            'agree by it correct its drift.'
+        ),
     ] = None,
     truth_topic: Annotated[
         str | None, typer.Option(help='True poses of the base in the map frame, to compare with.')
@@ -78,11 +85,13 @@ def replay(  # noqa: PLR0913 - the options of the command
     """
     from gam_relocalizer.localization.continuity import ContinuityOptions
     from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
+    from gam_relocalizer.replay.drift import trajectories_of
     from gam_relocalizer.replay.replay import ReplayOptions, replay_bag
     from gam_relocalizer.replay.report import Report, write_report
     from gam_relocalizer.replay.summary import row_of
     from gam_relocalizer.replay.writing import (
         output_folder,
+        write_corrected,
         write_fixes,
         write_summary,
         write_trajectory,
@@ -110,6 +119,7 @@ def replay(  # noqa: PLR0913 - the options of the command
         with _progress(scene_map) as progress:
             replayed = replay_bag(bag, localizer, options, progress)
         rows = [row_of(attempt) for attempt in replayed.attempts]
+        trajectories = trajectories_of(replayed.odometry, replayed.attempts)
         facts = _facts(bag, scene_map, options, replayed) | _network_facts(localizer_options)
         report = Report(
             title=f'Replay of {bag.resolve().name}',
@@ -117,10 +127,13 @@ def replay(  # noqa: PLR0913 - the options of the command
             scene_map=scene_map,
             illustrations=replayed.illustrations,
             facts={name: str(value) for name, value in facts.items()},
+            trajectories=trajectories,
         )
         write_trajectory(folder, rows)
+        if trajectories is not None:
+            write_corrected(folder, trajectories)
         write_fixes(folder, rows, map_frame)
-        write_summary(folder, rows, facts)
+        write_summary(folder, rows, facts, trajectories)
         write_report(folder, report)
     _print_summary(report, out)
 
@@ -173,7 +186,7 @@ def _network_facts(options: LocalizerOptions) -> dict[str, Any]:
 
 
 def _print_summary(report: Report, out: Path) -> None:
-    from gam_relocalizer.replay.report import REPORT, headline_numbers
+    from gam_relocalizer.replay.report import REPORT, headline_numbers, trajectory_errors
     from gam_relocalizer.replay.summary import summarise
 
     summary = summarise(report.rows)
@@ -188,4 +201,10 @@ def _print_summary(report: Report, out: Path) -> None:
         table.add_row(f'{stage}, median', f'{spread.median:.1f} ms')
     console = Console()
     console.print(table)
+    if errors := trajectory_errors(report):
+        header, *rows = errors
+        drift = Table(*header, title='Absolute trajectory errors')
+        for row in rows:
+            drift.add_row(*row)
+        console.print(drift)
     console.print(f'report: {out / REPORT}', markup=False, highlight=False, soft_wrap=True)

@@ -16,17 +16,20 @@ from gam_relocalizer.geometry import rotation_of
 from gam_relocalizer.localization.result import Status
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
+    from gam_relocalizer.geometry import PoseError
+    from gam_relocalizer.replay.drift import Trajectories
     from gam_relocalizer.replay.result import Illustration
     from gam_relocalizer.replay.summary import Row
     from gam_relocalizer.scene_map import SceneMap
 
 FIX, TRUTH, REFUSED, INLIER, REPROJECTED = '#0b62c4', '#111111', '#d62728', '#2bd34a', '#ff9d00'
 POINT, REFERENCE = '#8a8f98', '#c9a227'
+ODOMETRY, CORRECTED = '#f2a33a', '#2ca089'
 STAGE_COLOURS = ('#0b62c4', '#2ca089', '#f2a33a', '#b04fa8', '#777777')
 
 MAX_POINTS_DRAWN = 60_000
@@ -141,6 +144,35 @@ def draw_position_errors(axes: Axes, rows: Sequence[Row], unit: str) -> None:
         [factor * (row.position_std or np.nan) for row in fixes],
     )
     axes.set_ylabel(f'position [{shown}]', fontsize=LABEL_SIZE)
+
+
+def drift_figure(trajectories: Trajectories) -> Figure:
+    """Errors of odometry, fixes and corrected odometry over time; the map is metric."""
+    figure = Figure(figsize=(6.4, 4.8), layout='constrained')
+    position, orientation = figure.subplots(2, 1, sharex=True)
+    draw_drift(position, trajectories, lambda error: 100.0 * error.position)
+    draw_drift(orientation, trajectories, lambda error: error.rotation_deg)
+    position.set_ylabel('position error [cm]', fontsize=LABEL_SIZE)
+    orientation.set_ylabel('rotation error [deg]', fontsize=LABEL_SIZE)
+    orientation.set_xlabel('time [s]', fontsize=LABEL_SIZE)
+    return figure
+
+
+def draw_drift(axes: Axes, trajectories: Trajectories, size: Callable[[PoseError], float]) -> None:
+    """Errors of odometry, fixes and corrected odometry over time, where the truth is known."""
+    styles: dict[str, dict[str, Any]] = {
+        'odometry': {'color': ODOMETRY, 'linewidth': 1.2},
+        'fixes': {'color': FIX, 'marker': 'o', 'markersize': 3.5, 'linestyle': 'none'},
+        'corrected': {'color': CORRECTED, 'linewidth': 1.2},
+    }
+    begin_ns = min(poses[0].stamp_ns for poses in trajectories.by_name().values() if poses)
+    for name, poses in trajectories.by_name().items():
+        known = [(pose.stamp_ns, pose.error) for pose in poses]
+        errors = [(stamp_ns, size(error)) for stamp_ns, error in known if error is not None]
+        seconds = [(stamp_ns - begin_ns) / 1e9 for stamp_ns, _ in errors]
+        axes.plot(seconds, [value for _, value in errors], label=name, **styles[name])
+    axes.set_ylim(bottom=0)
+    _finish(axes)
 
 
 def inlier_figure(rows: Sequence[Row]) -> Figure:

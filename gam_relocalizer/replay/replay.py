@@ -7,7 +7,7 @@ from __future__ import annotations
 import logging
 import math
 from bisect import bisect_right
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 from gam_relocalizer.cameras import camera_from_calibration
@@ -35,7 +35,7 @@ from gam_relocalizer.replay.messages import (
     pose_in,
     rigid_in,
 )
-from gam_relocalizer.replay.result import Attempt, Illustration, Replay
+from gam_relocalizer.replay.result import Attempt, Illustration, OdometrySample, Replay
 from gam_relocalizer.transforms import TransformTree
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class ReplayOptions:
         camera: The camera; without it the bag's CameraInfo tells.
         image_topic: Needed only when the bag has several.
         camera_info_topic: Needed only when it is not beside the image topic.
-        odometry_topic: Odometry of the body, to compare the fixes with.
+        odometry_topic: Odometry of the body, to compare the fixes with and to be corrected by them.
         truth_topic: Poses of the body in the map frame to compare with.
         image_is_rectified: The images are rectified: use P of the CameraInfo, no distortion.
         covariance: Scales and floors of the covariance.
@@ -133,7 +133,7 @@ def replay_bag(
         topic = find_image_topic(bag, options.image_topic)
         facts = _read_facts(bag, topic, options)
         continuity = Continuity(options.continuity)
-        motion = _Motion(motion_bag, facts.transforms, continuity, options)
+        motion = _Motion(motion_bag, facts, continuity, options)
         begin_ns, end_ns = bag.time_range
         throttle, illustrations = _Throttle(options.period), _Illustrations()
         attempts: list[Attempt] = []
@@ -142,9 +142,13 @@ def replay_bag(
                 continue
             motion.advance_to(message.log_ns + DELAY_NS)
             attempt = _attempt(message, localizer, options, facts, continuity, illustrations)
+            attempt = replace(attempt, correction=continuity.correction)
             attempts.append(attempt)
             progress(attempt, (message.log_ns - begin_ns) / (end_ns - begin_ns))
-    return Replay(tuple(attempts), topic.name, topic.count, illustrations.chosen())
+        motion.advance_to(end_ns)
+    return Replay(
+        tuple(attempts), topic.name, topic.count, illustrations.chosen(), tuple(motion.odometry)
+    )
 
 
 class _Throttle:
@@ -232,18 +236,23 @@ def _add_truth(truth: TransformTree, message: BagMessage, options: ReplayOptions
 
 
 class _Motion:
-    """Takes in the moving transforms and the odometry of a bag, a little ahead of the images."""
+    """Takes in the moving transforms and the odometry of a bag, a little ahead of the images.
+
+    Attributes:
+        odometry: What was taken in so far, without stragglers.
+    """
 
     def __init__(
-        self, bag: Bag, tree: TransformTree, continuity: Continuity, options: ReplayOptions
+        self, bag: Bag, facts: _Facts, continuity: Continuity, options: ReplayOptions
     ) -> None:
         topics = [TF]
         if options.odometry_topic:
             topics.append(bag.require(options.odometry_topic, (ODOMETRY,), '--odom-topic').name)
+        self.odometry: list[OdometrySample] = []
         self._messages = bag.messages(topics)
-        self._tree = tree
+        self._facts = facts
         self._continuity = continuity
-        self._base_frame = options.base_frame
+        self._options = options
         self._next = next(self._messages, None)
 
     def advance_to(self, log_ns: int) -> None:
@@ -253,17 +262,22 @@ class _Motion:
 
     def _take_in(self, message: BagMessage) -> None:
         if message.topic.name == TF:
-            _add_transforms(self._tree, message, static=False)
+            _add_transforms(self._facts.transforms, message, static=False)
             return
-        child_frame = message.value.child_frame_id
-        if not is_odometry_of(child_frame, self._base_frame):
+        child_frame, base_frame = message.value.child_frame_id, self._options.base_frame
+        if not is_odometry_of(child_frame, base_frame):
             msg = (
                 f'{message.topic}: odometry of `{child_frame}`, the poses are those of '
-                f'`{self._base_frame}` (empty: the camera); they can be compared for one body '
+                f'`{base_frame}` (empty: the camera); they can be compared for one body '
                 f'only (--base-frame)'
             )
             raise BagError(msg)
-        self._continuity.add_odometry(message.stamp_ns, pose_in(message))
+        stamp_ns, odom_from_base = message.stamp_ns, pose_in(message)
+        self._continuity.add_odometry(stamp_ns, odom_from_base)
+        is_newer = not self.odometry or stamp_ns > self.odometry[-1].stamp_ns
+        if is_newer and self._options.continuity.metric:
+            truth = self._facts.truth_at(stamp_ns, self._options)
+            self.odometry.append(OdometrySample(stamp_ns, odom_from_base, truth))
 
 
 def _add_transforms(tree: TransformTree, message: BagMessage, *, static: bool) -> None:

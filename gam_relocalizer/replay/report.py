@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from gam_relocalizer.geometry import write_text
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.replay.figures import (
+    drift_figure,
     error_figure,
     inlier_figure,
     match_figure,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
+    from gam_relocalizer.replay.drift import Trajectories
     from gam_relocalizer.replay.result import Illustration
     from gam_relocalizer.replay.summary import Row, Spread
     from gam_relocalizer.scene_map import SceneMap
@@ -63,6 +65,7 @@ class Report:
         scene_map: The map.
         illustrations: Images whose matches are drawn; the first is on the overview, too.
         facts: What was run, by name: bag, map, options.
+        trajectories: Odometry, fixes and corrected odometry, when there was odometry.
     """
 
     title: str
@@ -70,6 +73,7 @@ class Report:
     scene_map: SceneMap
     illustrations: Sequence[Illustration] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
+    trajectories: Trajectories | None = None
 
     @property
     def unit(self) -> str:
@@ -103,6 +107,7 @@ def report_html(report: Report) -> str:
             f'<h1>{title}</h1>',
             *_numbers(report),
             *_figures(report),
+            *_drift(report),
             *_statuses(report),
             *_attempts(report),
             *_facts(report),
@@ -146,10 +151,8 @@ def headline_numbers(report: Report) -> dict[str, str]:
     numbers = {'fixes / attempts': f'{summary.accepted} / {summary.attempts}{share}'}
     if summary.position_error and summary.rotation_error_deg:
         position, rotation = summary.position_error, summary.rotation_error_deg
-        numbers['median error'] = (
-            f'{length_text(position.median, report.unit)}, {rotation.median:.2f}°'
-        )
-        numbers['largest error'] = f'{length_text(position.max, report.unit)}, {rotation.max:.2f}°'
+        numbers['median error'] = _error_text(position.median, rotation.median, report.unit)
+        numbers['largest error'] = _error_text(position.max, rotation.max, report.unit)
     if summary.total_milliseconds:
         time = summary.total_milliseconds
         numbers['time per attempt'] = f'{time.median:.0f} ms (95 %: {time.p95:.0f} ms)'
@@ -183,6 +186,42 @@ def _figures(report: Report) -> Iterator[str]:
         yield _image(error_figure(report.rows, report.unit), caption)
     yield _image(inlier_figure(report.rows), 'Inliers of each attempt.')
     yield _image(timing_figure(report.rows), 'Time of each attempt by stage.')
+
+
+def trajectory_errors(report: Report) -> list[tuple[str, ...]]:
+    """Header and rows of the table of absolute trajectory errors; empty without odometry or truth.
+
+    Each error is one of the position and one of the rotation.
+    """
+    errors = {} if report.trajectories is None else report.trajectories.errors()
+    rows = [
+        (
+            name,
+            str(error.poses),
+            _error_text(error.position_rmse, error.rotation_rmse_deg, report.unit),
+            _error_text(error.position_median, error.rotation_median_deg, report.unit),
+            _error_text(error.position_max, error.rotation_max_deg, report.unit),
+        )
+        for name, error in errors.items()
+    ]
+    return [('trajectory', 'poses', 'RMSE', 'median', 'largest'), *rows] if rows else []
+
+
+def _error_text(position: float, rotation_deg: float, unit: str) -> str:
+    return f'{length_text(position, unit)}, {rotation_deg:.2f}°'
+
+
+def _drift(report: Report) -> Iterator[str]:
+    table = trajectory_errors(report)
+    if report.trajectories is None or not table:
+        return
+    yield '<h2>Drift correction</h2>'
+    caption = (
+        'Errors of the odometry by itself, laid on the truth at its start; of the fixes; and of '
+        'the odometry as corrected by them, each fix from the time of its image on.'
+    )
+    yield _image(drift_figure(report.trajectories), caption)
+    yield from _table(table[0], table[1:])
 
 
 def _image(figure: Figure, caption: str) -> str:
@@ -226,7 +265,7 @@ def _cells(row: Row, unit: str) -> tuple[str, ...]:
         row.status.name,
         str(row.inliers),
         '' if deviation is None else length_text(deviation, unit),
-        '' if error is None else f'{length_text(error.position, unit)}, {error.rotation_deg:.2f}°',
+        '' if error is None else _error_text(error.position, error.rotation_deg, unit),
         f'{row.total_milliseconds:.0f}',
         row.reason,
     )

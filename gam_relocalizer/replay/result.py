@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     import pycolmap
     from numpy.typing import NDArray
 
+    from gam_relocalizer.localization.correction import Correction
     from gam_relocalizer.localization.result import LocalizationResult, PoseEstimate
     from gam_relocalizer.localization.robot_pose import RobotPose
 
@@ -25,11 +26,28 @@ class Attempt:
         result: What the localizer said.
         robot_pose: The body's pose, when accepted.
         truth: map_from_base at that time, when the bag tells.
+        correction: Where the odometry's frame lies in the map, as known after it.
     """
 
     stamp_ns: int
     result: LocalizationResult
     robot_pose: RobotPose | None = None
+    truth: pycolmap.Rigid3d | None = None
+    correction: Correction | None = None
+
+
+@dataclass(frozen=True)
+class OdometrySample:
+    """One message of the odometry.
+
+    Attributes:
+        stamp_ns: When it holds [ns].
+        odom_from_base: The pose of the body.
+        truth: map_from_base at that time, when the bag tells.
+    """
+
+    stamp_ns: int
+    odom_from_base: pycolmap.Rigid3d
     truth: pycolmap.Rigid3d | None = None
 
 
@@ -60,9 +78,12 @@ class Replay:
         images: Number of images there.
         illustrations: The accepted images with the most and the fewest inliers, in this order;
             one when they are the same, none when nothing was accepted.
+        odometry: In the order of its stamps, which strictly increase; empty without its topic, and
+            for a map that is not metric.
     """
 
     attempts: tuple[Attempt, ...]
     image_topic: str
     images: int
     illustrations: tuple[Illustration, ...]
+    odometry: tuple[OdometrySample, ...] = ()

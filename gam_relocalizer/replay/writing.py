@@ -3,8 +3,9 @@
 """The files of a replay: trajectory, bag of fixes, summary, report.
 
 `poses.tum` has a line `timestamp tx ty tz qx qy qz qw` of map_from_base for every fix, `fixes.mcap`
-the same with covariances as the node publishes it, `summary.json` the numbers, `report.html` the
-pictures and all attempts, `overview.png` the run in one picture.
+the same with covariances as the node publishes it, `corrected.tum` the odometry as corrected by the
+fixes, `summary.json` the numbers, `report.html` the pictures and all attempts, `overview.png` the
+run in one picture.
 """
 
 from __future__ import annotations
@@ -37,10 +38,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
+    import pycolmap
+
     from gam_relocalizer.localization.robot_pose import RobotPose
+    from gam_relocalizer.replay.drift import Trajectories
     from gam_relocalizer.replay.summary import Row
 
 POSES = 'poses.tum'
+CORRECTED = 'corrected.tum'
 FIXES = 'fixes.mcap'
 SUMMARY = 'summary.json'
 FIX_TOPIC = '/relocalized_pose'
@@ -108,7 +113,14 @@ def write_trajectory(folder: Path, rows: Sequence[Row]) -> None:
 
     The format is that of the TUM RGB-D benchmark, here with the stamp's nanoseconds in full.
     """
-    write_text(folder / POSES, ''.join(_tum_line(*fix) for fix in _fixes(rows)))
+    lines = (_tum_line(stamp_ns, pose.map_from_base) for stamp_ns, pose in _fixes(rows))
+    write_text(folder / POSES, ''.join(lines))
+
+
+def write_corrected(folder: Path, trajectories: Trajectories) -> None:
+    """Writes `corrected.tum`, in the format of `poses.tum`."""
+    lines = (_tum_line(pose.stamp_ns, pose.map_from_base) for pose in trajectories.corrected)
+    write_text(folder / CORRECTED, ''.join(lines))
 
 
 def write_fixes(folder: Path, rows: Sequence[Row], map_frame: str) -> None:
@@ -131,15 +143,27 @@ def write_fixes(folder: Path, rows: Sequence[Row], map_frame: str) -> None:
     shutil.rmtree(bag)
 
 
-def write_summary(folder: Path, rows: Sequence[Row], facts: Mapping[str, Any]) -> None:
+def write_summary(
+    folder: Path,
+    rows: Sequence[Row],
+    facts: Mapping[str, Any],
+    trajectories: Trajectories | None = None,
+) -> None:
     """Writes `summary.json`.
 
     Args:
         folder: An existing folder.
         rows: One per attempt.
         facts: What was run: bag, map, options; values that JSON knows.
+        trajectories: With odometry: their errors become `trajectory_errors`.
     """
-    content = {'kind': _KIND, **asdict(summarise(rows)), **facts}
+    errors = {} if trajectories is None else trajectories.errors()
+    content = {
+        'kind': _KIND,
+        **asdict(summarise(rows)),
+        'trajectory_errors': {name: asdict(error) for name, error in errors.items()},
+        **facts,
+    }
     write_text(folder / SUMMARY, json.dumps(content, indent=2) + '\n')
 
 
@@ -155,9 +179,9 @@ def _fixes(rows: Sequence[Row]) -> Iterator[tuple[int, RobotPose]]:
     return ((row.stamp_ns, row.robot_pose) for row in rows if row.robot_pose is not None)
 
 
-def _tum_line(stamp_ns: int, robot_pose: RobotPose) -> str:
-    w, x, y, z = quaternion_wxyz(robot_pose.map_from_base)
-    translation = robot_pose.map_from_base.translation
+def _tum_line(stamp_ns: int, map_from_base: pycolmap.Rigid3d) -> str:
+    w, x, y, z = quaternion_wxyz(map_from_base)
+    translation = map_from_base.translation
     seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
     # adding zero takes the minus off a zero
     numbers = ' '.join(f'{round(value, 9) + 0.0:.9f}' for value in (*translation, x, y, z, w))

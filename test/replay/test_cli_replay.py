@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from gam_relocalizer.cli.replay import replay
 from gam_relocalizer.errors import BagError, MapError, UsageError, WeightsError
 from gam_relocalizer.localization.localizer import Localizer
-from gam_relocalizer.replay.writing import FIXES, POSES, SUMMARY
+from gam_relocalizer.replay.writing import CORRECTED, FIXES, POSES, SUMMARY
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,6 +52,7 @@ def test_writes_all_files_and_succeeds_with_refused_attempts(
     names = {POSES, FIXES, SUMMARY, 'report.html', 'overview.png'}
     assert {file.name for file in out.iterdir()} == names
     summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
+    assert summary['trajectory_errors'] == {}
     assert (summary['attempts'], summary['accepted'], summary['images']) == (10, 9, 100)
     assert summary['image_topic'] == '/camera/image'
     assert (summary['matcher'], summary['weights']) == ('gam', None)
@@ -68,6 +69,26 @@ def test_fixes_that_odometry_speaks_against_are_told_as_implausible(
     summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
     assert summary['odometry_topic'] == '/odom'
     assert summary['statuses'] == {'ACCEPTED': 8, 'TOO_FEW_INLIERS': 1, 'IMPLAUSIBLE': 1}
+
+
+@pytest.mark.usefixtures('knowing_localizer')
+def test_odometry_is_written_corrected_and_its_errors_are_told(tmp_path: Path) -> None:
+    bag, out = write_bag(tmp_path / 'bag', fill_with_odometry), tmp_path / 'out'
+    result = run(
+        bag, '--map', 'wall', '--out', out, '--period', 1.0, '--odom-topic', '/odom',
+        '--truth-topic', '/ground_truth',
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    # from the second fix on, which confirms the first one
+    lines = (out / CORRECTED).read_text(encoding='utf-8').splitlines()
+    assert len(lines) == 90
+    errors = json.loads((out / SUMMARY).read_text(encoding='utf-8'))['trajectory_errors']
+    counts = {name: error['poses'] for name, error in errors.items()}
+    assert counts == {'odometry': 100, 'fixes': 9, 'corrected': 90}
+    for name, error in errors.items():
+        assert error['position_max'] < 1e-6
+        assert name in result.output
+    assert 'Drift correction' in (out / 'report.html').read_text(encoding='utf-8')
 
 
 def test_drive_through_a_rendered_room_is_found_twice_alike(

@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from gam_relocalizer.cameras import parse_camera
 from gam_relocalizer.errors import BagError, UsageError
 from gam_relocalizer.geometry import pose_error, rigid3d_from_rotation
+from gam_relocalizer.localization.continuity import ContinuityOptions
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.replay.messages import POSE_TYPES
 from gam_relocalizer.replay.replay import ReplayOptions, replay_bag
@@ -315,6 +316,39 @@ def test_odometry_tells_the_localizer_where_to_look_first(
         assert prior.hint is not None
         map_from_camera = camera_from_map_at(index).inverse()
         np.testing.assert_allclose(prior.hint.position, map_from_camera.translation, atol=1e-6)
+
+
+def test_odometry_comes_back_whole_and_corrected_by_fixes_that_agree(
+    tmp_path: Path, localizer: KnowingLocalizer
+) -> None:
+    localizer.mistaken = {0: 99, 60: 99}
+    options = ReplayOptions(period=1.0, odometry_topic='/odom', truth_topic='/ground_truth')
+    replay = replay_of(tmp_path, fill_with_odometry, localizer, options)
+    assert [sample.stamp_ns for sample in replay.odometry] == [stamp_of(i) for i in range(100)]
+    for index, sample in enumerate(replay.odometry):
+        assert sample.truth is not None
+        assert_same_pose(sample.truth, map_from_base_at(index))
+    # the first is wrong; the next is held back, and confirmed by the one after
+    corrections = [attempt.correction for attempt in replay.attempts]
+    assert corrections[:2] == [None, None]
+    for correction in corrections[2:]:
+        assert correction is not None
+        assert_same_pose(
+            correction.map_from_odom * replay.odometry[42].odom_from_base, map_from_base_at(42)
+        )
+    newest = [correction.stamp_ns for correction in corrections if correction is not None]
+    assert newest == [stamp_of(i) for i in (20, 30, 40, 50, 50, 70, 80, 90)]
+
+
+def test_in_a_map_without_metres_odometry_is_left_out(
+    tmp_path: Path, localizer: KnowingLocalizer
+) -> None:
+    options = ReplayOptions(
+        period=1.0, odometry_topic='/odom', continuity=ContinuityOptions(metric=False)
+    )
+    replay = replay_of(tmp_path, fill_with_odometry, localizer, options)
+    assert replay.odometry == ()
+    assert {attempt.correction for attempt in replay.attempts} == {None}
 
 
 def test_odometry_of_another_body_is_refused(tmp_path: Path, localizer: KnowingLocalizer) -> None:
