@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import rclpy
+from ros_graph import Graph
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -16,3 +17,10 @@ def ros() -> Iterator[None]:
     rclpy.init(args=[])
     yield
     rclpy.try_shutdown()
+
+
+@pytest.fixture
+def graph(ros: None) -> Iterator[Graph]:  # noqa: ARG001 - ROS must be up
+    graph = Graph()
+    yield graph
+    graph.close()
