@@ -228,6 +228,21 @@ class NodeParameters:
         'negative elements).',
         choices=('full', 'diagonal'),
     )
+    publish_map_odom: bool = _parameter(
+        default=False,
+        description='Whether to broadcast, on /tf, where the frame of the odometry lies in '
+        '`map_frame`; nobody else may.',
+        fixed=True,
+    )
+    map_odom_rate: float = _parameter(
+        20.0, 'Broadcasts of that transform per second (node clock) [Hz].', bounds=(0.1, 1000.0)
+    )
+    transform_tolerance: float = _parameter(
+        0.1,
+        'How far the stamp of that transform lies ahead of the clock, so that others find it valid '
+        'until the next one comes [s].',
+        bounds=(0.0, 10.0),
+    )
     torch_threads: int = _parameter(
         0,
         "Threads of the networks; 0: PyTorch's own choice.",

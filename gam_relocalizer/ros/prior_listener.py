@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rclpy.node import Node
 
     from gam_relocalizer.localization.continuity import Continuity
+    from gam_relocalizer.ros.health import Health
     from gam_relocalizer.ros.parameters import NodeParameters
 
 # SensorDataQoS, with room for what a quick odometry sends while this thread has no turn.
@@ -37,12 +38,16 @@ SAY_INITIAL_POSE_EACH_S = 1.0
 class PriorListener:
     """Subscribes to `odom` and `initialpose`."""
 
-    def __init__(self, node: Node, parameters: NodeParameters, continuity: Continuity) -> None:
+    def __init__(
+        self, node: Node, parameters: NodeParameters, continuity: Continuity, health: Health
+    ) -> None:
         self._node = node
         self._log = node.get_logger()
         self._map_frame = parameters.map_frame
         self._base_frame = parameters.base_frame
         self._continuity = continuity
+        self._health = health
+        self._odometry_frame: str | None = None
         self._odometry = node.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
         topic = node.resolve_topic_name('initialpose')
         cure = 'publish it reliably'
@@ -60,6 +65,11 @@ class PriorListener:
         name: str = self._odometry.topic_name
         return name
 
+    @property
+    def odometry_frame(self) -> str | None:
+        """Frame that the odometry in use is in; None before any has come."""
+        return self._odometry_frame
+
     def destroy(self) -> None:
         """Ends the subscriptions."""
         self._node.destroy_subscription(self._odometry)
@@ -67,6 +77,7 @@ class PriorListener:
 
     def _on_odometry(self, message: Odometry) -> None:
         if not is_odometry_of(message.child_frame_id, self._base_frame):
+            self._health.odometry_was_of(message.child_frame_id)
             self._say_other_body(message.child_frame_id)
             return
         try:
@@ -77,7 +88,20 @@ class PriorListener:
                 throttle_duration_sec=SAY_EACH_S,
             )
             return
+        self._follow(message.header.frame_id.strip('/'))
+        self._health.odometry_came()
         self._continuity.add_odometry(nanoseconds_from(message.header.stamp), odom_from_base)
+
+    def _follow(self, frame: str) -> None:
+        """Starts anew with another frame: what is known of one says nothing about another."""
+        if self._odometry_frame not in {None, frame}:
+            self._continuity.clear()
+            self._log.warning(
+                f'the odometry on {self.odometry_topic} was in frame `{self._odometry_frame}` and '
+                f'is in `{frame}` now: starting anew; if this comes again, two publish there',
+                throttle_duration_sec=SAY_EACH_S,
+            )
+        self._odometry_frame = frame
 
     def _say_other_body(self, child_frame: str) -> None:
         body = f'`{self._base_frame}`' if self._base_frame else 'the camera'

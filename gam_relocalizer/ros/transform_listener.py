@@ -19,11 +19,20 @@ try:
 except ImportError:  # an installation of ROS 2 from pip has no tf2_msgs of its own
     TFMessage = None
 
+__all__ = ['TF', 'TF_QOS', 'TFMessage', 'TransformListener']
+
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from geometry_msgs.msg import TransformStamped
     from rclpy.node import Node
     from rclpy.subscription import Subscription
 
+    # is called with a transform, and whether it is a static one
+    Watcher = Callable[[TransformStamped, bool], None]
+
+TF = '/tf'
+TF_STATIC = '/tf_static'
 # Those of tf2_ros.
 TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 TF_STATIC_QOS = QoSProfile(
@@ -35,20 +44,34 @@ WARN_EACH_S = 10.0
 
 
 class TransformListener:
-    """Subscribes to /tf and /tf_static."""
+    """Subscribes to /tf and /tf_static as soon as somebody wants to know."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self.tree = TransformTree()
+        self._watchers: list[Watcher] = []
         self._subscriptions: list[Subscription] = []
+        self._listens = False
+
+    def listen(self) -> None:
+        """Subscribes, from the first call on."""
+        if self._listens:
+            return
+        self._listens = True
         if TFMessage is None:
-            node.get_logger().warning(
-                'the package tf2_msgs is not installed, so /tf and /tf_static cannot be read: '
-                'install it, or give the mount of the camera in the parameter `base_from_camera`'
+            self._node.get_logger().warning(
+                'the package tf2_msgs is not installed, so /tf and /tf_static can be neither read '
+                'nor written: install it, or give the mount of the camera in the parameter '
+                '`base_from_camera` and leave `publish_map_odom` off'
             )
             return
-        self._subscribe('/tf', TF_QOS, static=False)
-        self._subscribe('/tf_static', TF_STATIC_QOS, static=True)
+        self._subscribe(TF, TF_QOS, static=False)
+        self._subscribe(TF_STATIC, TF_STATIC_QOS, static=True)
+
+    def watch(self, watcher: Watcher) -> None:
+        """Subscribes, and shows somebody every transform as it comes."""
+        self._watchers.append(watcher)
+        self.listen()
 
     def destroy(self) -> None:
         """Ends the subscriptions."""
@@ -56,23 +79,26 @@ class TransformListener:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
 
-    def _subscribe(self, topic: str, qos: QoSProfile, *, static: bool) -> None:
-        cure = f'publish {topic} as tf2_ros does'
+    def _subscribe(self, name: str, qos: QoSProfile, *, static: bool) -> None:
+        topic = self._node.resolve_topic_name(name)
+        cure = f'publish {name} as tf2_ros does'
         self._subscriptions.append(
             self._node.create_subscription(
                 TFMessage,
                 topic,
-                partial(self._take_in, static=static),
+                partial(self._take_in, topic=topic, static=static),
                 qos,
                 event_callbacks=incompatible_qos(self._node, topic, cure),
             )
         )
 
-    def _take_in(self, message: Any, *, static: bool) -> None:  # noqa: ANN401 - optional type
+    def _take_in(self, message: Any, *, topic: str, static: bool) -> None:  # noqa: ANN401 - optional type
         for transform in message.transforms:
-            self._take_in_one(transform, static=static)
+            self._take_in_one(transform, topic, static=static)
+            for watcher in self._watchers:
+                watcher(transform, static)
 
-    def _take_in_one(self, transform: TransformStamped, *, static: bool) -> None:
+    def _take_in_one(self, transform: TransformStamped, topic: str, *, static: bool) -> None:
         try:
             self.tree.add(
                 transform.header.frame_id,
@@ -83,6 +109,5 @@ class TransformListener:
             )
         except TransformError as err:
             self._node.get_logger().warning(
-                f'ignored from {"/tf_static" if static else "/tf"}: {err}',
-                throttle_duration_sec=WARN_EACH_S,
+                f'ignored from {topic}: {err}', throttle_duration_sec=WARN_EACH_S
             )
