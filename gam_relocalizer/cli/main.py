@@ -61,8 +61,9 @@ def _root(
 
 def main() -> None:
     """Runs the command line; exits with 0, 1 (failure) or 2 (the arguments cannot be used)."""
-    # The logging library inside pycolmap answers SIGTERM with a stack trace.
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # The logging library inside pycolmap answers SIGTERM with a stack trace: what was there before
+    # it, as Python remembers it.
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM) or signal.SIG_DFL)
     try:
         app()
     except RelocalizerError as err:
