@@ -23,6 +23,9 @@ class Status(Enum):
     NO_CALIBRATION = 2
     NO_TRANSFORM = 3
     STALE_IMAGE = 4
+    NO_IMAGE = 5
+    NOT_ACTIVE = 6
+    BUSY = 7
     TOO_FEW_FEATURES = 10
     NO_SCENE = 11
     TOO_FEW_MATCHES = 12

@@ -49,6 +49,10 @@ class Schedule:
         """A period has passed."""
         self._due = True
 
+    def rest(self) -> None:
+        """Nothing is due until the next tick."""
+        self._due = False
+
     def take(self) -> StampedImage:
         """The image to try now; it will not come again. Ask `ready` first."""
         if self._newest is None:
@@ -69,8 +73,8 @@ class Schedule:
         """Whether a stamp lies so far before the last image that the source has started again."""
         return self._last_stamp_ns is not None and stamp_ns < self._last_stamp_ns - RESTART_NS
 
-    def restart(self) -> None:
+    def restart(self, *, due: bool = True) -> None:
         """Forgets images and stamps, as when time jumped back."""
         self._newest = None
-        self._due = True
+        self._due = due
         self._last_stamp_ns = None

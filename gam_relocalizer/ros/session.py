@@ -1,47 +1,47 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node does while it is active: from an image that arrives to what is published."""
+"""What the node does while it is active: which image is tried when, and who hears of it."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pycolmap
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
-from std_msgs.msg import Header
 
 from gam_relocalizer.errors import TransformError
 from gam_relocalizer.localization.continuity import Continuity
+from gam_relocalizer.localization.prior import Prior
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import robot_pose
 from gam_relocalizer.replay.messages import calibration_of
 from gam_relocalizer.ros.attempt import Attempt
-from gam_relocalizer.ros.conversions import nanoseconds_from, pixels_from, stamp_from
-from gam_relocalizer.ros.debug_image import draw_attempt
+from gam_relocalizer.ros.conversions import nanoseconds_from
 from gam_relocalizer.ros.inputs import Inputs
+from gam_relocalizer.ros.map_odom_broadcaster import MapOdomBroadcaster
+from gam_relocalizer.ros.mount import Mount
 from gam_relocalizer.ros.prior_listener import PriorListener
+from gam_relocalizer.ros.reporter import Reporter
+from gam_relocalizer.ros.requests import Answer, BroughtImages, CameraRequests
 from gam_relocalizer.ros.schedule import Schedule, StampedImage
 from gam_relocalizer.ros.transform_listener import TransformListener
 
 if TYPE_CHECKING:
     from rclpy.clock import TimeJump
     from rclpy.lifecycle import LifecycleNode
+    from rclpy.task import Future
     from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
     from gam_relocalizer.cameras import CameraCalibration
     from gam_relocalizer.localization.continuity import ContinuityOptions
-    from gam_relocalizer.localization.prior import Prior
-    from gam_relocalizer.localization.robot_pose import RobotPose
+    from gam_relocalizer.ros.health import Health
     from gam_relocalizer.ros.outputs import Outputs
     from gam_relocalizer.ros.parameters import NodeParameters
     from gam_relocalizer.ros.worker import Worker
 
-SAY_FIX_EACH_S = 1.0
-SAY_REFUSAL_EACH_S = 5.0
 SAY_SILENCE_EACH_S = 10.0
-SAY_ODOMETRY_EACH_S = 10.0
 ANY_JUMP_BACK = JumpThreshold(
     min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
 )
@@ -56,21 +56,36 @@ class Session:
         parameters: NodeParameters,
         worker: Worker,
         outputs: Outputs,
+        health: Health,
     ) -> None:
         self._log = node.get_logger()
         self._node = node
         self._parameters = parameters
         self._worker = worker
         self._outputs = outputs
+        self._health = health
         self._schedule = Schedule()
+        self._enabled = True
         self._calibration: CameraCalibration | None = None
         self._heard_an_image = False
         self._waited_for_calibration = False
-        self._transforms: TransformListener | None = None
-        self._listen_to_transforms()
+        # what an attempt that began in an earlier one gives is of no interest any more
+        self._epoch = 0
+        self._camera_had_its_turn = False
+        self._camera_requests = CameraRequests(node, self._why_late)
+        self._brought_images = BroughtImages()
         self._continuity = Continuity(self._continuity_options())
-        self._prior_listener = PriorListener(node, parameters, self._continuity)
+        self._transforms = TransformListener(node)
+        self._mount = Mount(node, parameters, self._transforms)
+        self._reporter = Reporter(node, parameters, outputs, self._mount, self._continuity, health)
+        self._prior_listener = PriorListener(node, parameters, self._continuity, health)
+        self._broadcaster = MapOdomBroadcaster(
+            node, parameters, self._continuity, self._prior_listener, self._transforms, health
+        )
         self._inputs = Inputs(node, parameters, self._on_image, self._on_camera_info)
+        health.activated(
+            self._inputs.image_topic, parameters.period, broadcasts=parameters.publish_map_odom
+        )
         self._timer = node.create_timer(parameters.period, self._on_tick)
         self._jump_handle = node.get_clock().create_jump_callback(
             ANY_JUMP_BACK, post_callback=self._on_jump_back
@@ -78,13 +93,16 @@ class Session:
 
     def close(self) -> None:
         """Ends the subscriptions; an attempt under way comes to nothing."""
-        self._worker.abandon()
+        self._epoch += 1
+        over = Answer(LocalizationResult(Status.NOT_ACTIVE, 'the node was deactivated meanwhile'))
+        self._camera_requests.answer_all(over)
+        self._brought_images.answer_all(over)
         self._jump_handle.unregister()
         self._node.destroy_timer(self._timer)
         self._inputs.destroy()
+        self._broadcaster.destroy()
         self._prior_listener.destroy()
-        if self._transforms is not None:
-            self._transforms.destroy()
+        self._transforms.destroy()
 
     def use(self, parameters: NodeParameters) -> None:
         """Takes other parameters from now on."""
@@ -92,59 +110,94 @@ class Session:
             self._timer.timer_period_ns = round(parameters.period * 1e9)
             self._timer.reset()
         self._parameters = parameters
+        self._health.period_s = parameters.period
         self._continuity.options = self._continuity_options()
-        self._listen_to_transforms()
+        self._mount.use(parameters)
+        self._broadcaster.use(parameters)
+        self._reporter.use(parameters)
 
-    def on_worker_done(self) -> None:
-        """Publishes the result of the worker and starts the next attempt if one is due."""
-        finished = self._worker.fetch()
-        if finished is not None:
-            self._report(*finished)
-        self._proceed()
+    def map_was_replaced(self) -> None:
+        """Forgets what belongs to the map before; an attempt under way on it comes to nothing."""
+        self._forget('the map was replaced meanwhile; ask again')
+        self._continuity.options = self._continuity_options()
+
+    def set_enabled(self, *, enabled: bool) -> None:
+        """Goes on with, or stops, attempts that nobody asks for."""
+        self._enabled = enabled
+        if enabled:
+            self._schedule.tick()
+            self.proceed()
+        else:
+            self._schedule.rest()
+
+    def relocalize(self, timeout_s: float) -> Future:
+        """Tries the next image that comes.
+
+        Args:
+            timeout_s: How long to wait for the attempt to begin.
+
+        Returns:
+            The future of an `Answer`, with the pose of the base.
+        """
+        return self._camera_requests.add(timeout_s)
+
+    def localize_image(self, image: Image, camera_info: CameraInfo) -> Future:
+        """Tries an image of whatever camera, and publishes nothing.
+
+        Returns:
+            The future of an `Answer`, with the pose of that camera.
+        """
+        attempt = Attempt(
+            image=StampedImage(image, nanoseconds_from(image.header.stamp)),
+            image_topic='the request',
+            calibration=calibration_of(camera_info),
+            image_is_rectified=False,
+            prior=Prior(),
+        )
+        future = self._brought_images.add(attempt)
+        self.proceed()
+        return future
+
+    def proceed(self) -> None:
+        """Starts an attempt if one is wanted and possible: camera and callers take turns."""
+        if self._worker.busy:
+            return
+        if self._brought_images.ready and (self._camera_had_its_turn or not self._camera_is_ready):
+            self._begin_brought()
+        elif self._camera_is_ready:
+            self._begin_camera()
 
     def _continuity_options(self) -> ContinuityOptions:
         metric = self._worker.scene_map.manifest.frame.metric
         return self._parameters.continuity_options(metric=metric)
-
-    def _listen_to_transforms(self) -> None:
-        """Subscribes to the transforms if they are what tells the mount of the camera."""
-        if self._parameters.mount() is not None or self._transforms is not None:
-            return
-        if self._parameters.base_frame:
-            self._transforms = TransformListener(self._node)
-        else:
-            self._log.info(
-                'the parameter `base_frame` is empty: the published pose is that of the camera '
-                '(its optical frame), not of the robot',
-                once=True,
-            )
 
     # What arrives
 
     def _on_image(self, message: Image | CompressedImage) -> None:
         self._heard_an_image = True
         image = StampedImage(message, nanoseconds_from(message.header.stamp))
+        self._health.image_came(self._node.get_clock().now().nanoseconds - image.stamp_ns)
         if self._schedule.went_back(image.stamp_ns):
             self._restart('the stamps of the images jumped back')
         self._schedule.offer(image)
-        self._proceed()
+        if self._camera_requests.image_came():
+            self._schedule.tick()
+        self.proceed()
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         self._calibration = calibration_of(message)
-        self._proceed()
+        self.proceed()
 
     def _on_tick(self) -> None:
+        if not self._enabled:
+            return
+        self._health.period_over(busy=self._worker.busy)
         self._schedule.tick()
         if not self._heard_an_image:
             self._say_silence()
         if self._schedule.ready and self._calibration is None and self._gave_calibration_time():
-            topic = self._inputs.camera_info_topic
-            reason = (
-                f'no CameraInfo has come on {topic}; have the driver publish it, or remap '
-                f'camera_info'
-            )
-            self._refuse(self._schedule.take(), Status.NO_CALIBRATION, reason)
-        self._proceed()
+            self._refuse(self._schedule.take(), Status.NO_CALIBRATION, self._no_calibration())
+        self.proceed()
 
     def _gave_calibration_time(self) -> bool:
         """False once: the CameraInfo may come a moment after its image, and after this tick."""
@@ -157,135 +210,97 @@ class Session:
     def _restart(self, why: str) -> None:
         """Forgets what belongs to the time before a jump, so that a looping bag starts anew."""
         self._log.warning(f'{why}: starting anew')
-        self._worker.abandon()
-        self._schedule.restart()
+        self._health.time_jumped()
+        self._forget(f'{why} meanwhile; ask again')
+        self._schedule.restart(due=self._enabled)
+        self._transforms.tree.clear_history()
+
+    def _forget(self, why: str) -> None:
+        self._epoch += 1
+        self._camera_requests.answer(Answer(LocalizationResult(Status.NO_IMAGE, why)))
         self._continuity.clear()
         self._outputs.forget_path()
-        if self._transforms is not None:
-            self._transforms.tree.clear_history()
 
     def _say_silence(self) -> None:
-        topic = self._inputs.image_topic
-        publishers = self._node.count_publishers(topic)
         self._log.warning(
-            f'no image has come on {topic} yet ({publishers} publishers); remap it with '
-            f'`-r image:=/your/topic`',
+            f'{self._no_image()}; remap it with `-r image:=/your/topic`',
             throttle_duration_sec=SAY_SILENCE_EACH_S,
         )
 
+    def _no_image(self) -> str:
+        topic = self._inputs.image_topic
+        return f'no image has come on {topic} yet ({self._node.count_publishers(topic)} publishers)'
+
+    def _no_calibration(self) -> str:
+        topic = self._inputs.camera_info_topic
+        return (
+            f'no CameraInfo has come on {topic}; have the driver publish it, or remap camera_info'
+        )
+
+    def _why_late(self, has_image: bool) -> LocalizationResult:  # noqa: FBT001 - of a callback
+        if not has_image:
+            return LocalizationResult(
+                Status.NO_IMAGE,
+                f'no image came on {self._inputs.image_topic} before the time was over',
+            )
+        if self._calibration is None:
+            return LocalizationResult(Status.NO_CALIBRATION, self._no_calibration())
+        return LocalizationResult(Status.BUSY, 'other attempts took until the time was over')
+
     # Attempts
 
-    def _proceed(self) -> None:
-        """Starts an attempt if one is due and possible."""
-        if self._worker.busy or self._calibration is None or not self._schedule.ready:
-            return
+    @property
+    def _camera_is_ready(self) -> bool:
+        return self._calibration is not None and self._schedule.ready
+
+    def _begin_camera(self) -> None:
         image = self._schedule.take()
+        self._camera_requests.begin()
+        if self._calibration is None:
+            msg = 'an attempt without a calibration'
+            raise RuntimeError(msg)
         if not self._schedule.accepts(image.stamp_ns):
             reason = (
                 f'the stamp of the image, {image.stamp_ns / 1e9:.6f} s, is not after that of the '
                 f'last one tried; does the driver stamp its images?'
             )
             self._refuse(image, Status.STALE_IMAGE, reason)
+            self.proceed()
             return
-        self._worker.begin(
-            Attempt(
-                image=image,
-                image_topic=self._inputs.image_topic,
-                calibration=self._calibration,
-                image_is_rectified=self._parameters.image_is_rectified,
-                prior=self._prior(image),
-            )
+        self._camera_had_its_turn = True
+        attempt = Attempt(
+            image=image,
+            image_topic=self._inputs.image_topic,
+            calibration=self._calibration,
+            image_is_rectified=self._parameters.image_is_rectified,
+            prior=self._prior(image),
         )
+        self._worker.begin(attempt, partial(self._end_camera, attempt, self._epoch))
 
     def _prior(self, image: StampedImage) -> Prior:
         try:
-            base_from_camera = self._base_from_camera(image)
+            base_from_camera = self._mount.base_from_camera(image)
         except TransformError:  # it may come while the attempt is under way
             base_from_camera = None
         return self._continuity.prior(image.stamp_ns, base_from_camera)
 
-    def _report(self, attempt: Attempt, result: LocalizationResult) -> None:
-        result = self._publish(attempt.image, result)
-        if self._outputs.debug_image_is_wanted and result.status is not Status.UNDECODABLE_IMAGE:
-            pixels = pixels_from(attempt.image.message, attempt.image_topic)
-            header = attempt.image.message.header
-            self._outputs.publish_debug_image(header, draw_attempt(pixels, result))
-
-    def _publish(self, image: StampedImage, result: LocalizationResult) -> LocalizationResult:
-        """Publishes a result, and hands it back as it was published."""
-        if not result.accepted or result.estimate is None:
-            return self._publish_refusal(image, result)
-        try:
-            base_from_camera = self._base_from_camera(image)
-        except TransformError as err:
-            reason = f'{err}; publish the mount of the camera in TF or set `base_from_camera`'
-            return self._publish_refusal(
-                image, replace(result, status=Status.NO_TRANSFORM, reason=reason)
-            )
-        pose = robot_pose(result.estimate, base_from_camera, self._parameters.covariance_options())
-        judged = self._judge(image, result, pose)
-        if not judged.accepted:
-            return self._publish_refusal(image, judged)
-        header = self._header(image)
-        self._outputs.publish_fix(header, pose, result.estimate.camera_from_map)
-        self._outputs.publish_status(header, judged, self._worker.map_id)
-        self._say_fix(pose, judged)
-        return judged
-
-    def _judge(
-        self, image: StampedImage, result: LocalizationResult, pose: RobotPose
-    ) -> LocalizationResult:
-        """Holds back what odometry speaks against, and says so when odometry cannot be used."""
-        result = self._continuity.judge(image.stamp_ns, result, pose)
-        topic = self._prior_listener.odometry_topic
-        if self._continuity.misses_odometry(image.stamp_ns):
-            self._log.warning(
-                f'the odometry on {topic} has nothing for the stamps of the images: fixes are not '
-                f'compared with it; do their clocks agree?',
-                throttle_duration_sec=SAY_ODOMETRY_EACH_S,
-            )
-        if self._continuity.doubts_odometry:
-            self._log.warning(
-                f'several fixes in a row fit neither each other nor the last one by the odometry '
-                f'on {topic}: it is doubted, and fixes pass until two agree by it again; is it '
-                f'that of this robot, in metres, and do its wheels slip?',
-                throttle_duration_sec=SAY_ODOMETRY_EACH_S,
-            )
-        return result
-
-    def _base_from_camera(self, image: StampedImage) -> pycolmap.Rigid3d:
-        mount = self._parameters.mount()
-        if mount is not None:
-            return mount
-        if self._transforms is None:
-            return pycolmap.Rigid3d()
-        camera_frame = image.message.header.frame_id
-        if not camera_frame:
-            msg = f'the images on {self._inputs.image_topic} have no frame_id'
-            raise TransformError(msg)
-        return self._transforms.tree.lookup(
-            self._parameters.base_frame, camera_frame, image.stamp_ns
-        )
+    def _end_camera(self, attempt: Attempt, epoch: int, result: LocalizationResult) -> None:
+        if epoch == self._epoch:
+            answer = self._reporter.report(attempt, result, self._worker.map_id)
+            self._camera_requests.answer(answer)
 
     def _refuse(self, image: StampedImage, status: Status, reason: str) -> None:
-        self._publish_refusal(image, LocalizationResult(status, reason))
+        answer = self._reporter.refuse(image, status, reason, self._worker.map_id)
+        self._camera_requests.answer(answer)
 
-    def _publish_refusal(
-        self, image: StampedImage, result: LocalizationResult
-    ) -> LocalizationResult:
-        self._outputs.publish_status(self._header(image), result, self._worker.map_id)
-        self._log.warning(
-            f'no fix, {result.status.name}: {result.reason}',
-            throttle_duration_sec=SAY_REFUSAL_EACH_S,
-        )
-        return result
+    def _begin_brought(self) -> None:
+        attempt = self._brought_images.begin()
+        self._camera_had_its_turn = False
+        self._worker.begin(attempt, partial(self._end_brought, attempt, self._worker.map_id))
 
-    def _say_fix(self, pose: RobotPose, result: LocalizationResult) -> None:
-        x, y, z = pose.map_from_base.translation
-        self._log.info(
-            f'fix at {x:.3f} {y:.3f} {z:.3f}: {result.reason}; {result.timings.total:.0f} ms',
-            throttle_duration_sec=SAY_FIX_EACH_S,
-        )
-
-    def _header(self, image: StampedImage) -> Header:
-        return Header(stamp=stamp_from(image.stamp_ns), frame_id=self._parameters.map_frame)
+    def _end_brought(self, attempt: Attempt, map_id: str, result: LocalizationResult) -> None:
+        pose = None
+        if result.accepted and result.estimate is not None:
+            options = self._parameters.covariance_options()
+            pose = robot_pose(result.estimate, pycolmap.Rigid3d(), options)
+        self._brought_images.answer(Answer(result, map_id, attempt.image.stamp_ns, pose))

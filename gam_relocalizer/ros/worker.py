@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Job:
-    attempt: Attempt
     future: Future[LocalizationResult]
+    on_result: Callable[[LocalizationResult], None]
 
 
 class Worker:
@@ -36,58 +36,60 @@ class Worker:
 
         Args:
             localizer: The model.
-            on_done: Called from the worker's thread when a result can be fetched.
+            on_done: Called from the worker's thread when `finish` has something to do.
         """
         self._localizer = localizer
-        self._map_id = localizer.scene_map.manifest.map_id
         self._on_done = on_done
         self._job: _Job | None = None
-        self._wanted = True
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix='relocalizer')
 
     @property
     def busy(self) -> bool:
-        """Whether an attempt is under way, or done and not yet fetched."""
+        """Whether an attempt is under way, or done and not yet finished."""
         return self._job is not None
 
     @property
     def map_id(self) -> str:
-        """Identity of the map that is searched."""
-        return self._map_id
+        """Identity of the map that the next attempt searches."""
+        return self.scene_map.manifest.map_id
 
     @property
     def scene_map(self) -> SceneMap:
-        """The map that is searched."""
+        """The map that the next attempt searches."""
         return self._localizer.scene_map
 
-    def begin(self, attempt: Attempt) -> None:
-        """Starts an attempt; the worker must not be busy."""
+    def begin(self, attempt: Attempt, on_result: Callable[[LocalizationResult], None]) -> None:
+        """Starts an attempt; the worker must not be busy.
+
+        Args:
+            attempt: The attempt.
+            on_result: Called by `finish`.
+        """
         if self.busy:
             msg = 'the worker is busy'
             raise RuntimeError(msg)
         future = self._pool.submit(carry_out, attempt, self._localizer)
-        self._job, self._wanted = _Job(attempt, future), True
+        self._job = _Job(future, on_result)
         future.add_done_callback(lambda _future: self._on_done())
 
-    def abandon(self) -> None:
-        """The result of the attempt under way is no longer wanted."""
-        self._wanted = False
-
-    def fetch(self) -> tuple[Attempt, LocalizationResult] | None:
-        """The finished attempt, which makes the worker idle; None while there is none.
+    def finish(self) -> None:
+        """Hands on the result of an attempt that is over, which makes the worker idle.
 
         An exception of the attempt is raised here: it is a defect, and hiding it would leave a
         node that looks alive.
         """
         if self._job is None or not self._job.future.done():
-            return None
+            return
         job, self._job = self._job, None
-        result = job.future.result()
-        return (job.attempt, result) if self._wanted else None
+        job.on_result(job.future.result())
 
     def use(self, options: LocalizerOptions) -> None:
         """Takes other options from the next attempt on."""
         self._localizer = self._localizer.with_options(options)
+
+    def replace(self, localizer: Localizer) -> None:
+        """Takes another model, with another map, from the next attempt on."""
+        self._localizer = localizer
 
     def close(self) -> None:
         """Waits for the attempt under way, then ends the thread."""

@@ -29,11 +29,12 @@ CALIBRATION = CameraCalibration(
 class GatedLocalizer:
     """Answers when it is let; its reason tells the options it had."""
 
-    scene_map = SimpleNamespace(manifest=SimpleNamespace(map_id='abc'))
-
-    def __init__(self, gate: threading.Event, options: LocalizerOptions) -> None:
+    def __init__(
+        self, gate: threading.Event, options: LocalizerOptions, map_id: str = 'abc'
+    ) -> None:
         self.gate = gate
         self.options = options
+        self.scene_map = SimpleNamespace(manifest=SimpleNamespace(map_id=map_id))
 
     def with_options(self, options: LocalizerOptions) -> GatedLocalizer:
         return GatedLocalizer(self.gate, options)
@@ -58,6 +59,10 @@ class Bench:
         self.gate = threading.Event()
         self.done = threading.Event()
         self.worker = Worker(GatedLocalizer(self.gate, LocalizerOptions()), self.done.set)
+        self.results: list[LocalizationResult] = []
+
+    def begin(self, brightness: int = 0) -> None:
+        self.worker.begin(attempt(brightness), self.results.append)
 
     def let_finish(self) -> None:
         self.gate.set()
@@ -74,62 +79,70 @@ def bench() -> Iterator[Bench]:
     bench.worker.close()
 
 
-def test_it_is_busy_until_its_result_is_fetched(bench: Bench) -> None:
+def test_it_is_busy_until_its_result_is_handed_on(bench: Bench) -> None:
     assert not bench.worker.busy
-    asked = attempt()
-    bench.worker.begin(asked)
+    bench.begin()
     assert bench.worker.busy
-    assert bench.worker.fetch() is None
+    bench.worker.finish()
+    assert bench.worker.busy
     bench.let_finish()
     assert bench.worker.busy
-    finished = bench.worker.fetch()
-    assert finished is not None
-    assert finished[0] is asked
-    assert finished[1].status is Status.NO_POSE
+    assert not bench.results
+    bench.worker.finish()
+    assert [result.status for result in bench.results] == [Status.NO_POSE]
     assert not bench.worker.busy
 
 
 def test_it_takes_no_second_attempt_while_busy(bench: Bench) -> None:
-    bench.worker.begin(attempt())
+    bench.begin()
     with pytest.raises(RuntimeError):
-        bench.worker.begin(attempt())
+        bench.begin()
 
 
-def test_an_abandoned_attempt_comes_to_nothing_and_the_next_one_counts(bench: Bench) -> None:
-    bench.worker.begin(attempt())
-    bench.worker.abandon()
-    bench.let_finish()
-    assert bench.worker.fetch() is None
-    assert not bench.worker.busy
-    bench.worker.begin(attempt())
-    bench.let_finish()
-    assert bench.worker.fetch() is not None
+def test_whoever_takes_a_result_may_begin_the_next_attempt(bench: Bench) -> None:
+    bench.worker.begin(attempt(), lambda _result: bench.begin())
+    for _ in range(2):
+        bench.let_finish()
+        bench.worker.finish()
+    assert len(bench.results) == 1
 
 
 def test_other_options_hold_from_the_next_attempt_on(bench: Bench) -> None:
-    bench.worker.begin(attempt())
+    bench.begin()
     bench.worker.use(LocalizerOptions(max_scenes=9))
     bench.let_finish()
-    first = bench.worker.fetch()
-    bench.worker.begin(attempt())
+    bench.worker.finish()
+    bench.begin()
     bench.let_finish()
-    second = bench.worker.fetch()
-    assert first is not None
-    assert second is not None
+    bench.worker.finish()
     default = f'{LocalizerOptions().max_scenes} scenes'
-    assert (first[1].reason, second[1].reason) == (default, '9 scenes')
+    assert [result.reason for result in bench.results] == [default, '9 scenes']
 
 
-def test_a_defect_comes_out_where_the_result_is_fetched(bench: Bench) -> None:
-    bench.worker.begin(attempt(brightness=255))
+def test_another_model_serves_from_the_next_attempt_on(bench: Bench) -> None:
+    bench.begin()
+    bench.worker.replace(GatedLocalizer(bench.gate, LocalizerOptions(max_scenes=7), 'xyz'))
+    assert bench.worker.map_id == 'xyz'
+    bench.let_finish()
+    bench.worker.finish()
+    bench.begin()
+    bench.let_finish()
+    bench.worker.finish()
+    default = f'{LocalizerOptions().max_scenes} scenes'
+    assert [result.reason for result in bench.results] == [default, '7 scenes']
+
+
+def test_a_defect_comes_out_where_the_result_is_handed_on(bench: Bench) -> None:
+    bench.begin(brightness=255)
     bench.let_finish()
     with pytest.raises(ZeroDivisionError):
-        bench.worker.fetch()
+        bench.worker.finish()
     assert not bench.worker.busy
 
 
 def test_closing_waits_for_the_attempt_under_way(bench: Bench) -> None:
-    bench.worker.begin(attempt())
+    bench.begin()
     threading.Timer(0.1, bench.gate.set).start()
     bench.worker.close()
-    assert bench.worker.fetch() is not None
+    bench.worker.finish()
+    assert len(bench.results) == 1

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -11,9 +12,12 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+from uuid import uuid4
 
+import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
@@ -35,20 +39,22 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from gam_relocalizer.geometry import quaternion_wxyz, rigid3d_from
+from gam_relocalizer.geometry import pose_error, quaternion_wxyz, rigid3d_from
 from gam_relocalizer_msgs.msg import RelocalizationStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    import numpy as np
     import pycolmap
+    from geometry_msgs.msg import Pose
     from numpy.typing import NDArray
     from rclpy.node import Node
+    from tiny_place import TinyPlace
 
 T = TypeVar('T')
 REPOSITORY = Path(__file__).parents[2]
 NODE = '/gam_relocalizer'
+MARK = 'GAM_RELOCALIZER_TEST'
 LIMIT_S = 60.0
 PATIENCE_S = 5.0
 QUICK = {
@@ -61,6 +67,7 @@ LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 CAMERA_FRAME = 'camera_optical'
+POSITION_TOLERANCE_M, ROTATION_TOLERANCE_DEG = 0.05, 1.0
 BASE_FROM_CAMERA = rigid3d_from((0.5, -0.5, 0.5, -0.5), (0.2, -0.1, 0.3))
 
 
@@ -81,6 +88,7 @@ class NodeProcess:
         self, log: Path, *arguments: str, remap: Sequence[str] = (), **parameters: object
     ) -> None:
         self._log = log
+        self._mark = uuid4().hex  # whoever is left of it can be found by it
         values = QUICK | parameters
         settings = [word for item in values.items() for word in ('-p', _assignment(*item))]
         settings += [word for rule in remap for word in ('-r', rule)]
@@ -91,6 +99,7 @@ class NodeProcess:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 cwd=REPOSITORY,
+                env=os.environ | {MARK: self._mark},
             )
 
     @property
@@ -112,6 +121,26 @@ class NodeProcess:
             self.process.send_signal(number)
         return self.process.wait(LIMIT_S)
 
+    def end_cleanly(self, *signals: signal.Signals) -> None:
+        """As `stop`; it must end with 0, complain of nothing, and leave nobody behind."""
+        code = self.stop(*signals)
+        assert code == 0, f'ended with {code}: {self.log}'
+        assert 'Traceback' not in self.log, self.log
+        assert _processes_with(f'{MARK}={self._mark}') == []
+
+
+def _processes_with(setting: str) -> list[int]:
+    """Processes that were started with a setting in their environment."""
+    found = []
+    for environment in Path('/proc').glob('[0-9]*/environ'):
+        try:
+            settings = environment.read_bytes().split(b'\0')
+        except OSError:  # somebody else's, or ended meanwhile
+            continue
+        if setting.encode() in settings:
+            found.append(int(environment.parent.name))
+    return found
+
 
 def _assignment(name: str, value: object) -> str:
     return f'{name}:={str(value).lower() if isinstance(value, bool) else value}'
@@ -129,36 +158,67 @@ class Heard:
 class Robot:
     """The other side of the node's topics and services."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(
+        self,
+        node: Node,
+        namespace: str = '',
+        pose_topic: str = '/relocalized_pose',
+        image_topic: str = 'image',
+    ) -> None:
+        """Publishes nothing yet.
+
+        Args:
+            node: Its own.
+            namespace: That of the relocalizer, whose `image` and the like are relative to it.
+            pose_topic: What `/relocalized_pose` is remapped to.
+            image_topic: What `image` is remapped to, in that namespace.
+        """
         self.node = node
         self.heard = Heard()
         self.camera_info: CameraInfo | None = None
-        self._image = node.create_publisher(Image, '/image', 1)
+        self.stamps = count(1000.0, 0.25)
+        self._relocalizer = namespace + NODE
+        self._namespace = namespace
+        self._pose_topic = pose_topic
+        self._image_topic = f'{namespace}/{image_topic}'
+        self._tf_static = node.create_publisher(TFMessage, f'{namespace}/tf_static', LATCHED)
         self._compressed = node.create_publisher(CompressedImage, '/front/image/compressed', 1)
-        self._camera_info = node.create_publisher(CameraInfo, '/camera_info', 1)
-        self._tf_static = node.create_publisher(TFMessage, '/tf_static', LATCHED)
-        node.create_subscription(
-            RelocalizationStatus, f'{NODE}/status', self.heard.statuses.append, 100
-        )
-        node.create_subscription(
-            PoseWithCovarianceStamped, '/relocalized_pose', self.heard.poses.append, 100
-        )
-        node.create_subscription(
-            PoseStamped, f'{NODE}/camera_pose', self.heard.camera_poses.append, 100
-        )
+        self._switch_camera_on()
+        hear = node.create_subscription
+        hear(RelocalizationStatus, self.topic('status'), self.heard.statuses.append, 100)
+        hear(PoseWithCovarianceStamped, pose_topic, self.heard.poses.append, 100)
+        hear(PoseStamped, self.topic('camera_pose'), self.heard.camera_poses.append, 100)
+
+    def _switch_camera_on(self) -> None:
+        create = self.node.create_publisher
+        self._image = create(Image, self._image_topic, 1)
+        self._camera_info = create(CameraInfo, f'{self._namespace}/camera_info', 1)
+
+    def restart_camera(self) -> None:
+        """The driver ends and starts again."""
+        self.node.destroy_publisher(self._image)
+        self.node.destroy_publisher(self._camera_info)
+        self._switch_camera_on()
+
+    def topic(self, name: str) -> str:
+        """The name of a topic or service that the node calls `~/name`."""
+        return f'{self._relocalizer}/{name}'
 
     def connect(self, node: NodeProcess, *, compressed: bool = False) -> None:
         """Waits until the node is active, and all topics have found each other."""
-        publishers = [self._compressed if compressed else self._image, self._camera_info]
-        topics = ['/relocalized_pose', f'{NODE}/status', f'{NODE}/camera_pose']
 
         def connected() -> bool:
             assert node.alive, node.log
-            return all(p.get_subscription_count() for p in publishers) and all(
-                self.node.count_publishers(topic) for topic in topics
-            )
+            return self.is_connected(compressed=compressed)
 
         wait_for(connected, 'the node to subscribe')
+
+    def is_connected(self, *, compressed: bool = False) -> bool:
+        publishers = [self._compressed if compressed else self._image, self._camera_info]
+        topics = [self._pose_topic, self.topic('status'), self.topic('camera_pose')]
+        return all(p.get_subscription_count() for p in publishers) and all(
+            self.node.count_publishers(topic) for topic in topics
+        )
 
     def wait_until_alone(self) -> None:
         """Waits until nobody subscribes to the images any more."""
@@ -180,6 +240,10 @@ class Robot:
                 ]
             )
         )
+
+    def shot(self, pixels: NDArray[np.uint8], **changes: Any) -> Image:  # noqa: ANN401
+        """An image message that is newer than all before."""
+        return image_message(pixels, next(self.stamps), **changes)
 
     def show(self, image: Image | CompressedImage) -> None:
         """Publishes an image as a driver does, with its calibration."""
@@ -205,32 +269,65 @@ class Robot:
             lambda: _of_stamp(self.heard.poses, image.header.stamp), 'a pose for the image'
         )
 
+    def assert_at(self, image: Image | CompressedImage, base_from_map: pycolmap.Rigid3d) -> None:
+        """The node must have published that pose for an image."""
+        fix = self.fix_of(image)
+        error = pose_error(rigid3d_of(fix.pose.pose).inverse(), base_from_map)
+        assert error.position < POSITION_TOLERANCE_M
+        assert error.rotation_deg < ROTATION_TOLERANCE_DEG
+
+    def refusal_of(
+        self,
+        image: Image | CompressedImage,
+        good: Callable[[], Image | CompressedImage],
+    ) -> RelocalizationStatus:
+        """The status of an image that gets no fix; a good one after it has to get one."""
+        status = self.ask(image)
+        assert not status.accepted, status.reason
+        assert status.reason
+        # one connection keeps its order: once the next fix is here, a pose would have come before
+        after = good()
+        assert self.ask(after).accepted
+        self.fix_of(after)
+        assert _of_stamp(self.heard.poses, image.header.stamp) is None
+        return status
+
     def change_state(self, transition: int) -> bool:
         self.state()  # so that the two ends have found each other: this must not be asked twice
         request = ChangeState.Request(transition=Transition(id=transition))
-        answer = self._call(ChangeState, f'{NODE}/change_state', request, patience=LIMIT_S)
+        answer = self.call(ChangeState, self.topic('change_state'), request, patience=LIMIT_S)
         return bool(answer.success)
 
     def request_state(self, transition: int) -> None:
         """As `change_state`, for a request that gets no answer."""
         self.state()
-        client = self.node.create_client(ChangeState, f'{NODE}/change_state')
+        client = self.node.create_client(ChangeState, self.topic('change_state'))
         assert client.wait_for_service(LIMIT_S)
         client.call_async(ChangeState.Request(transition=Transition(id=transition)))
 
     def state(self) -> str:
-        response = self._call(GetState, f'{NODE}/get_state', GetState.Request())
+        response = self.call(GetState, self.topic('get_state'), GetState.Request())
         return str(response.current_state.label)
 
     def set_parameter(self, name: str, value: object) -> tuple[bool, str]:
         request = SetParameters.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg()]
         )
-        result = self._call(SetParameters, f'{NODE}/set_parameters', request).results[0]
+        result = self.call(SetParameters, self.topic('set_parameters'), request).results[0]
         return bool(result.successful), str(result.reason)
 
-    def _call(self, kind: type, name: str, request: object, patience: float = PATIENCE_S) -> Any:  # noqa: ANN401 - a response
-        """The answer; asked again, as DDS can lose a request while both ends find each other."""
+    def call(
+        self,
+        kind: type,
+        name: str,
+        request: object,
+        patience: float = PATIENCE_S,
+        meanwhile: Callable[[], None] = lambda: None,
+    ) -> Any:  # noqa: ANN401 - a response
+        """The answer; asked again, as DDS can lose a request while both ends find each other.
+
+        `meanwhile` is called again and again until then.
+        """
         client = self.node.create_client(kind, name)
         assert client.wait_for_service(LIMIT_S), name
         asked = time.monotonic()
@@ -241,6 +338,7 @@ class Robot:
             if time.monotonic() > asked + patience:
                 asked = time.monotonic()
                 futures.append(client.call_async(request))
+            meanwhile()
             return next((future for future in futures if future.done()), None)
 
         future = wait_for(answered, name)
@@ -250,6 +348,13 @@ class Robot:
 
 def _of_stamp(messages: list[T], stamp: Time) -> T | None:
     return next((message for message in messages if message.header.stamp == stamp), None)
+
+
+def rigid3d_of(pose: Pose) -> pycolmap.Rigid3d:
+    """A pose of a message, whose quaternion must have unit length."""
+    q, t = pose.orientation, pose.position
+    assert abs(np.linalg.norm([q.w, q.x, q.y, q.z]) - 1.0) < 1e-9
+    return rigid3d_from((q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
 
 
 def image_message(
@@ -284,6 +389,43 @@ def camera_info(camera: pycolmap.Camera) -> CameraInfo:
         k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
     )
+
+
+@contextmanager
+def node_process(log: Path, *arguments: str, **options: Any) -> Iterator[NodeProcess]:  # noqa: ANN401
+    """A node that has to end cleanly."""
+    node = NodeProcess(log, *arguments, **options)
+    try:
+        yield node
+        node.end_cleanly()
+    finally:
+        node.process.kill()
+        node.process.wait()
+
+
+@contextmanager
+def running_node(
+    log: Path,
+    tiny_place: TinyPlace,
+    **options: Any,  # noqa: ANN401
+) -> Iterator[tuple[NodeProcess, Robot]]:
+    """A node with the map of the tiny place that has had its first fix, and its robot.
+
+    Args:
+        log: File for what the node says.
+        tiny_place: Where the robot is.
+        options: Of `NodeProcess`.
+    """
+    with (
+        node_process(log, '--map', str(tiny_place.map_path), **options) as node,
+        spinning_node('robot') as own,
+    ):
+        robot = Robot(own)
+        robot.mount_camera()
+        robot.connect(node)
+        robot.camera_info = camera_info(tiny_place.camera)
+        robot.wait_for_first_fix(tiny_place.queries[0][0], robot.stamps)
+        yield node, robot
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from live_robot import (
     Robot,
     camera_info,
     image_message,
+    rigid3d_of,
     spinning_node,
     wait_for,
 )
@@ -32,8 +33,6 @@ from gam_relocalizer_msgs.msg import RelocalizationStatus
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    import pycolmap
-    from geometry_msgs.msg import Pose
     from tiny_place import TinyPlace
 
 # they rise over all tests of this file, which share a node
@@ -65,12 +64,6 @@ def robot(running: Robot) -> Robot:
     for messages in vars(running.heard).values():
         messages.clear()
     return running
-
-
-def rigid3d_of(pose: Pose) -> pycolmap.Rigid3d:
-    q, t = pose.orientation, pose.position
-    assert abs(np.linalg.norm([q.w, q.x, q.y, q.z]) - 1.0) < 1e-9
-    return rigid3d_from((q.w, q.x, q.y, q.z), (t.x, t.y, t.z))
 
 
 def test_the_pose_of_the_base_is_that_of_the_truth(robot: Robot, tiny_place: TinyPlace) -> None:
