@@ -231,7 +231,8 @@ def _checked_camera(
         camera_id=1, model=model, width=width, height=height, params=list(params)
     )
     camera.has_prior_focal_length = True
-    if not all(math.isfinite(value) for value in params) or camera.mean_focal_length() <= 0:
+    focal = [params[index] for index in camera.focal_length_idxs()]
+    if not all(math.isfinite(value) for value in params) or min(focal) <= 0:
         msg = f'{source}: parameters must be finite and the focal length positive, found {params}'
         raise CameraError(msg)
     return camera

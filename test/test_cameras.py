@@ -111,6 +111,7 @@ def test_zero_binning_and_zero_region_mean_the_whole_image() -> None:
         {'k': (0.0,) * 9},
         {'k': ()},
         {'k': (np.nan, *K[1:])},
+        {'k': (-0.9 * K[4], *K[1:])},  # its mean with the other is positive
         {'distortion_model': 'plumb_bob', 'd': (0.1, 0.2)},
         {'distortion_model': 'plumb_bob', 'd': (0.1, np.inf, 0.0, 0.0)},
         {'distortion_model': 'kannala', 'd': (0.1, 0.2, 0.0, 0.0)},
