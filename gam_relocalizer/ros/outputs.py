@@ -5,11 +5,18 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.qos import (
+    DurabilityPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_policy_name_from_kind,
+    qos_profile_sensor_data,
+)
 from sensor_msgs.msg import Image, PointCloud2
 
 from gam_relocalizer.ros.conversions import (
@@ -45,11 +52,16 @@ class Outputs:
     """The publishers; silent while the node is not active."""
 
     def __init__(self, node: LifecycleNode) -> None:
-        create = node.create_lifecycle_publisher
+
+        def create(kind: type, name: str, qos: QoSProfile) -> Any:  # noqa: ANN401 - untyped
+            return node.create_lifecycle_publisher(
+                kind, name, qos, event_callbacks=_incompatible_qos(node, name, qos)
+            )
+
         self._pose = create(PoseWithCovarianceStamped, POSE_TOPIC, LATCHED_QOS)
-        self._camera_pose = create(PoseStamped, '~/camera_pose', 10)
-        self._status = create(RelocalizationStatus, '~/status', 10)
-        self._path = create(Path, '~/path', 1)
+        self._camera_pose = create(PoseStamped, '~/camera_pose', QoSProfile(depth=10))
+        self._status = create(RelocalizationStatus, '~/status', QoSProfile(depth=10))
+        self._path = create(Path, '~/path', QoSProfile(depth=1))
         self._map_points = create(PointCloud2, '~/map_points', LATCHED_QOS)
         self._debug_image = create(Image, '~/debug_image', qos_profile_sensor_data)
         self._fixes: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
@@ -90,3 +102,19 @@ class Outputs:
     def forget_path(self) -> None:
         """Starts the path anew."""
         self._fixes.clear()
+
+
+def _incompatible_qos(node: LifecycleNode, name: str, qos: QoSProfile) -> PublisherEventCallbacks:
+    """Says in the log which listener is not served, and what to change."""
+    topic = node.resolve_topic_name(name)
+    reliability, durability = (policy.name.lower() for policy in (qos.reliability, qos.durability))
+
+    def report(event: Any) -> None:  # noqa: ANN401 - a type of the extension module
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        node.get_logger().warning(
+            f'nothing will be sent to a subscription to {topic}: its quality of service '
+            f'({policy}) is not compatible; subscribe with reliability {reliability} and '
+            f'durability {durability}'
+        )
+
+    return PublisherEventCallbacks(incompatible_qos=report)
