@@ -186,6 +186,10 @@ class Continuity:
         """Whether poses pass although odometry speaks against them; see `OdometryGate`."""
         return self._gate.doubts_odometry
 
+    def awaits_odometry(self, stamp_ns: int) -> bool:
+        """Whether the odometry at that time is still to come, as that of a VIO after its image."""
+        return self._track.is_behind(stamp_ns)
+
     def misses_odometry(self, stamp_ns: int) -> bool:
         """Whether there is odometry, but none at that time."""
         return not self._track.is_empty and self._track.at(stamp_ns) is None

@@ -106,6 +106,10 @@ class OdometryTrack:
         """Whether a stamp lies so far before the last sample that time has jumped back."""
         return bool(self._stamps) and stamp_ns < self._stamps[-1] - RESTART_NS
 
+    def is_behind(self, stamp_ns: int) -> bool:
+        """Whether samples come, but those for a time are still to come."""
+        return bool(self._stamps) and HOLD_NS < stamp_ns - self._stamps[-1] <= MAX_GAP_NS
+
     def add(self, stamp_ns: int, odom_from_base: pycolmap.Rigid3d) -> None:
         """Takes in one sample; stragglers are left out.
 

@@ -42,6 +42,14 @@ class Mount:
                 once=True,
             )
 
+    def is_known(self, image: StampedImage) -> bool:
+        """Whether `base_from_camera` can tell."""
+        try:
+            self.base_from_camera(image)
+        except TransformError:
+            return False
+        return True
+
     def base_from_camera(self, image: StampedImage) -> pycolmap.Rigid3d:
         """The mount of the camera that took an image, when it did.
 

@@ -8,7 +8,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import pycolmap
-from rclpy.clock import JumpThreshold
+from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 
 from gam_relocalizer.errors import TransformError
@@ -42,6 +43,9 @@ if TYPE_CHECKING:
     from gam_relocalizer.ros.worker import Worker
 
 SAY_SILENCE_EACH_S = 10.0
+# What a VIO says of an image comes after it; nobody's attempts are held up for longer.
+PATIENCE_NS = 300_000_000
+PATIENCE_STEP_S = 0.02
 ANY_JUMP_BACK = JumpThreshold(
     min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False
 )
@@ -72,6 +76,13 @@ class Session:
         # what an attempt that began in an earlier one gives is of no interest any more
         self._epoch = 0
         self._camera_had_its_turn = False
+        # an image that is due, and waits for odometry and transforms of its time
+        self._candidate: StampedImage | None = None
+        self._patience_ends_ns = 0
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._patience_timer = node.create_timer(
+            PATIENCE_STEP_S, self._on_patience, clock=self._steady_clock
+        )
         self._camera_requests = CameraRequests(node, self._why_late)
         self._brought_images = BroughtImages()
         self._continuity = Continuity(self._continuity_options())
@@ -99,6 +110,7 @@ class Session:
         self._brought_images.answer_all(over)
         self._jump_handle.unregister()
         self._node.destroy_timer(self._timer)
+        self._node.destroy_timer(self._patience_timer)
         self._inputs.destroy()
         self._broadcaster.destroy()
         self._prior_listener.destroy()
@@ -217,6 +229,7 @@ class Session:
 
     def _forget(self, why: str) -> None:
         self._epoch += 1
+        self._candidate = None
         self._camera_requests.answer(Answer(LocalizationResult(Status.NO_IMAGE, why)))
         self._continuity.clear()
         self._outputs.forget_path()
@@ -251,22 +264,50 @@ class Session:
 
     @property
     def _camera_is_ready(self) -> bool:
+        if self._candidate is not None:
+            return not self._is_early(self._candidate)
         return self._calibration is not None and self._schedule.ready
 
     def _begin_camera(self) -> None:
+        """Tries the image that is due, or waits with it for what is known of its time."""
+        if self._candidate is None:
+            self._candidate = self._take()
+        if self._candidate is None:
+            self.proceed()
+        elif not self._is_early(self._candidate):
+            self._try(self._candidate)
+
+    def _take(self) -> StampedImage | None:
+        """The image that is due; None when it cannot be tried."""
         image = self._schedule.take()
         self._camera_requests.begin()
+        if self._schedule.accepts(image.stamp_ns):
+            self._patience_ends_ns = self._steady_clock.now().nanoseconds + PATIENCE_NS
+            self._patience_timer.reset()
+            return image
+        reason = (
+            f'the stamp of the image, {image.stamp_ns / 1e9:.6f} s, is not after that of the '
+            f'last one tried; does the driver stamp its images?'
+        )
+        self._refuse(image, Status.STALE_IMAGE, reason)
+        return None
+
+    def _is_early(self, image: StampedImage) -> bool:
+        """Whether odometry and transforms for the time of an image may still be on their way."""
+        if self._steady_clock.now().nanoseconds >= self._patience_ends_ns:
+            return False
+        return self._continuity.awaits_odometry(image.stamp_ns) or not self._mount.is_known(image)
+
+    def _on_patience(self) -> None:
+        if self._candidate is None:
+            self._patience_timer.cancel()
+        self.proceed()
+
+    def _try(self, image: StampedImage) -> None:
         if self._calibration is None:
             msg = 'an attempt without a calibration'
             raise RuntimeError(msg)
-        if not self._schedule.accepts(image.stamp_ns):
-            reason = (
-                f'the stamp of the image, {image.stamp_ns / 1e9:.6f} s, is not after that of the '
-                f'last one tried; does the driver stamp its images?'
-            )
-            self._refuse(image, Status.STALE_IMAGE, reason)
-            self.proceed()
-            return
+        self._candidate = None
         self._camera_had_its_turn = True
         attempt = Attempt(
             image=image,

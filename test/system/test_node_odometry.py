@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import time
 from itertools import count
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from sensor_msgs.msg import Image
     from tiny_place import TinyPlace
 
+VIO_TAKES_S = 0.2
 # they rise over all tests of this file, which share a node
 STAMPS = count(1000.0, 0.25)
 
@@ -53,6 +55,17 @@ class Parked:
         for moment in np.linspace(stamp - 0.1, stamp + 0.1, 5):
             self.say_odometry(moment)
         return image, Status(self.robot.ask(image).status)
+
+    def see_elsewhere_before_the_odometry(self) -> tuple[Image, Status]:
+        """As with a VIO, which needs the image to tell where the robot was."""
+        stamp = next(STAMPS)
+        image = image_message(self._elsewhere, stamp)
+        self.robot.show(image)
+        time.sleep(VIO_TAKES_S)
+        for moment in np.linspace(stamp - 0.1, stamp + 0.1, 5):
+            self.say_odometry(moment)
+        verdict = wait_for(lambda: self.robot.verdict_on(image), 'a verdict')
+        return image, Status(verdict.status)
 
     def say_odometry(self, stamp: float, child_frame: str = 'base_link') -> None:
         pose = PoseWithCovariance(pose=Pose(position=Point(x=3.0, y=-2.0)))
@@ -108,6 +121,13 @@ def test_odometry_of_another_body_is_named_once(parked: Parked) -> None:
 def test_one_fix_that_odometry_speaks_against_is_held_back(parked: Parked) -> None:
     assert parked.see()[1] is Status.ACCEPTED
     image, status = parked.see(elsewhere=True)
+    assert status is Status.IMPLAUSIBLE
+    assert not parked.was_published(image)
+
+
+def test_odometry_that_comes_after_the_image_speaks_against_a_fix_as_well(parked: Parked) -> None:
+    assert parked.see()[1] is Status.ACCEPTED
+    image, status = parked.see_elsewhere_before_the_odometry()
     assert status is Status.IMPLAUSIBLE
     assert not parked.was_published(image)
 
