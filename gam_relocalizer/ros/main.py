@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.parameter import Parameter
 from rclpy.utilities import ok, try_shutdown
 
 from gam_relocalizer.errors import UsageError
+from gam_relocalizer.ros.executor import GatheringExecutor
 from gam_relocalizer.ros.node import RelocalizerNode
 
 if TYPE_CHECKING:
@@ -82,13 +83,13 @@ def _init(args: Sequence[str]) -> None:
 
 def _spin(node: RelocalizerNode) -> None:
     """Spins until the context ends."""
-    executor = SingleThreadedExecutor()
+    executor = GatheringExecutor()
     executor.add_node(node)
     while ok():
         _spin_once(executor, node)
 
 
-def _spin_once(executor: SingleThreadedExecutor, node: RelocalizerNode) -> None:
+def _spin_once(executor: GatheringExecutor, node: RelocalizerNode) -> None:
     """Waits for something to do, and does it.
 
     The wait is bounded: now and then the end of the context wakes no wait that is about to begin,

@@ -28,6 +28,7 @@ from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.ros.diagnostics import Diagnostics
 from gam_relocalizer.ros.health import Health
 from gam_relocalizer.ros.map_loader import MapLoader
+from gam_relocalizer.ros.memory import give_back_freed_memory
 from gam_relocalizer.ros.outputs import Outputs
 from gam_relocalizer.ros.parameters import declare_parameters, fixed_changes, known_among
 from gam_relocalizer.ros.requests import Answer, answered
@@ -241,6 +242,7 @@ class RelocalizerNode(LifecycleNode):
                 self._session.map_was_replaced()
                 self._show_map(loaded.scene_map)
             future.set_result((True, self._describe(loaded.scene_map)))
+            give_back_freed_memory()
 
     def _set_map(self, path: str) -> None:
         """Makes the parameter say which map it is."""
@@ -308,6 +310,7 @@ class RelocalizerNode(LifecycleNode):
             self._worker.close()
             self._worker = None
             self.health.unloaded()
+            give_back_freed_memory()
 
     def _on_thread_done(self) -> None:
         """Takes over what the worker or the loader has done."""
