@@ -226,7 +226,7 @@ class Disagreement:
 
     Attributes:
         found: The difference.
-        allowed: How large it may be.
+        allowed: How large each part may be where the other is nothing.
     """
 
     found: PoseError
@@ -235,7 +235,8 @@ class Disagreement:
     def __str__(self) -> str:
         return (
             f'{self.found.position:.2f} m and {self.found.rotation_deg:.1f} deg; up to '
-            f'{self.allowed.position:.2f} m and {self.allowed.rotation_deg:.1f} deg are allowed'
+            f'{self.allowed.position:.2f} m or {self.allowed.rotation_deg:.1f} deg are allowed, '
+            f'and less of both together'
         )
 
 
@@ -317,7 +318,8 @@ def disagreement(before: Fix, fix: Fix, drift: float) -> Disagreement | None:
         drift: See `predict`.
 
     Returns:
-        None when they agree, within the margin of the prediction and 3 sigma of the later fix.
+        None when they agree, within the margin of the prediction and 3 sigma of the later fix:
+        position and rotation by what share each uses up of that, in square, and no more than 1.
     """
     prediction = predict(before, fix.odometry, drift)
     found = pose_error(fix.pose.map_from_base.inverse(), prediction.map_from_base.inverse())
@@ -326,9 +328,8 @@ def disagreement(before: Fix, fix: Fix, drift: float) -> Disagreement | None:
         prediction.margin.position + SIGMAS * position_std,
         prediction.margin.rotation_deg + SIGMAS * math.degrees(rotation_std),
     )
-    if found.position <= allowed.position and found.rotation_deg <= allowed.rotation_deg:
-        return None
-    return Disagreement(found, allowed)
+    share = math.hypot(found.position / allowed.position, found.rotation_deg / allowed.rotation_deg)
+    return None if share <= 1.0 else Disagreement(found, allowed)
 
 
 class OdometryGate:

@@ -116,6 +116,16 @@ def test_stragglers_change_nothing() -> None:
     assert_close(reading.odom_from_base, circling_at(0.5))
 
 
+def test_odometry_is_behind_while_it_comes_but_has_not_got_there() -> None:
+    track = track_of(0.0, 0.5)
+    half = SECOND // 2
+    assert not OdometryTrack().is_behind(half)
+    assert not track.is_behind(half + HOLD_NS)
+    assert track.is_behind(half + HOLD_NS + 1)
+    assert track.is_behind(half + MAX_GAP_NS)
+    assert not track.is_behind(half + MAX_GAP_NS + 1)
+
+
 def test_a_jump_back_in_time_starts_anew() -> None:
     track = track_of(100.0, 100.5)
     assert not track.went_back(100 * SECOND)
@@ -438,6 +448,16 @@ def test_a_turned_fix_is_held_back_as_a_shifted_one() -> None:
     assert against[1] is not None
     assert against[1].found.rotation_deg == pytest.approx(20.0)
     assert against[1].allowed.rotation_deg < 20.0
+
+
+def test_a_fix_that_is_both_shifted_and_turned_is_held_back_sooner() -> None:
+    before = fix_of(planar(0.0, 0.0, 0.0), STANDING)
+    far = disagreement(before, fix_of(planar(50.0, 0.0, 0.0), STANDING), DRIFT)
+    assert far is not None
+    shift, turn = 0.8 * far.allowed.position, 0.8 * far.allowed.rotation_deg
+    assert disagreement(before, fix_of(planar(shift, 0.0, 0.0), STANDING), DRIFT) is None
+    assert disagreement(before, fix_of(planar(0.0, 0.0, turn), STANDING), DRIFT) is None
+    assert disagreement(before, fix_of(planar(shift, 0.0, turn), STANDING), DRIFT) is not None
 
 
 def test_a_cleared_gate_has_nothing_to_compare_with() -> None:
