@@ -35,12 +35,18 @@ class PoseError:
 
 
 def rigid3d_from(quaternion_wxyz: ArrayLike, translation: ArrayLike) -> pycolmap.Rigid3d:
-    """Rigid transform from a quaternion (w, x, y, z; any length but zero) and a translation [3]."""
-    w, x, y, z = np.asarray(quaternion_wxyz, dtype=float)
-    xyzw = Rotation.from_quat([x, y, z, w]).as_quat()
-    return pycolmap.Rigid3d(
-        rotation=pycolmap.Rotation3d(xyzw), translation=np.asarray(translation, dtype=float)
-    )
+    """Rigid transform from a quaternion (w, x, y, z; any length but zero) and a translation [3].
+
+    Raises:
+        ValueError: The quaternion is zero.
+    """
+    # not through SciPy, which takes long for one: all of /tf and the odometry come through here
+    rotation = pycolmap.Rotation3d(np.asarray(quaternion_wxyz, dtype=float)[[1, 2, 3, 0]])
+    if rotation.norm() == 0.0:
+        msg = 'a quaternion of length zero is no rotation'
+        raise ValueError(msg)
+    rotation.normalize()
+    return pycolmap.Rigid3d(rotation=rotation, translation=np.asarray(translation, dtype=float))
 
 
 def rigid3d_from_rotation(rotation: Rotation, translation: ArrayLike) -> pycolmap.Rigid3d:

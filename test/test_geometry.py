@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from gam_relocalizer.errors import PosesFileError
@@ -28,6 +29,8 @@ from gam_relocalizer.geometry import (
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
 numbers = st.floats(-1e6, 1e6)
 vectors = st.tuples(numbers, numbers, numbers)
@@ -172,3 +175,16 @@ def test_covariance_of_the_base_matches_samples_of_a_rotated_offset_mount() -> N
         sampled_covariance(samples, map_from_camera * base_from_camera.inverse()),
         covariance_of_map_from_base(map_from_camera, covariance, base_from_camera),
     )
+
+
+def test_a_quaternion_of_length_zero_is_no_rotation() -> None:
+    with pytest.raises(ValueError, match='length zero'):
+        rigid3d_from((0.0, 0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+
+
+@given(hnp.arrays(float, 4, elements=st.floats(-10.0, 10.0)))
+def test_the_length_of_a_quaternion_does_not_matter(wxyz: NDArray[np.float64]) -> None:
+    assume(np.linalg.norm(wxyz) > 1e-3)
+    expected = Rotation.from_quat(wxyz[[1, 2, 3, 0]]).as_matrix()
+    found = rigid3d_from(wxyz, (0.0, 0.0, 0.0)).matrix()[:, :3]
+    np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -108,7 +109,7 @@ def rigid_in(translation: Any, quaternion: Any) -> pycolmap.Rigid3d:  # noqa: AN
     """
     wxyz = [quaternion.w, quaternion.x, quaternion.y, quaternion.z]
     xyz = [translation.x, translation.y, translation.z]
-    if not np.isfinite([*wxyz, *xyz]).all() or np.linalg.norm(wxyz) < 1e-6:
+    if not all(map(math.isfinite, (*wxyz, *xyz))) or math.hypot(*wxyz) < 1e-6:
         msg = f'translation {xyz}, quaternion (w, x, y, z) {wxyz}'
         raise ValueError(msg)
     return rigid3d_from(wxyz, xyz)
