@@ -74,6 +74,7 @@ class Condition(Enum):
     TRANSITION_FAILED = auto()
     UNCONFIGURED = auto()
     INACTIVE = auto()
+    FINALIZED = auto()
     DISABLED = auto()
     NO_CLOCK = auto()
     CLOCK_STANDS = auto()
@@ -192,6 +193,8 @@ def _state_findings(health: Health) -> Iterator[_Finding]:
         yield _Finding(Condition.UNCONFIGURED, 'no map is loaded; configure and activate the node')
     elif health.state is State.INACTIVE:
         yield _Finding(Condition.INACTIVE, 'the node does not listen; activate it')
+    elif health.state is State.FINALIZED:
+        yield _Finding(Condition.FINALIZED, 'the node was shut down; start its process again')
     elif not health.enabled:
         yield _Finding(Condition.DISABLED, 'no attempt is made unless a service asks for one')
 

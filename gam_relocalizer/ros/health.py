@@ -42,6 +42,7 @@ class State(Enum):
     UNCONFIGURED = 'unconfigured'
     INACTIVE = 'inactive'
     ACTIVE = 'active'
+    FINALIZED = 'finalized'
 
 
 @dataclass(frozen=True)
@@ -323,6 +324,11 @@ class Health:
         """The node is unconfigured."""
         self.deactivated()
         self.state, self.map, self.map_error, self.device = State.UNCONFIGURED, None, '', ''
+
+    def shut_down(self) -> None:
+        """The node does nothing any more, whatever it is asked for."""
+        self.unloaded()
+        self.state, self.error = State.FINALIZED, ''
 
     # What happens while the node is active; of what comes late, nothing is kept
 

@@ -26,7 +26,7 @@ from gam_relocalizer.errors import RelocalizerError, UsageError
 from gam_relocalizer.localization.localizer import Localizer
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.ros.diagnostics import Diagnostics
-from gam_relocalizer.ros.health import Health
+from gam_relocalizer.ros.health import Health, State
 from gam_relocalizer.ros.map_loader import MapLoader
 from gam_relocalizer.ros.memory import give_back_freed_memory
 from gam_relocalizer.ros.outputs import Outputs
@@ -148,6 +148,7 @@ class RelocalizerNode(LifecycleNode):
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Ends everything, from whatever state."""
         self._unload()
+        self.health.shut_down()
         return super().on_shutdown(state)
 
     @_reported
@@ -203,7 +204,9 @@ class RelocalizerNode(LifecycleNode):
             The future of whether it is in use now, and what there is to say.
         """
         future = Future()
-        if self._loader.busy:
+        if self.health.state is State.FINALIZED:
+            future.set_result((False, self._not_active().result.reason))
+        elif self._loader.busy:
             future.set_result((False, 'another map is being loaded; ask again later'))
         elif self._worker is None:
             future.set_result(self._start_with(path))
@@ -250,12 +253,13 @@ class RelocalizerNode(LifecycleNode):
         self.set_parameters([Parameter('map', value=path)])
 
     def _not_active(self) -> Answer:
-        state = 'unconfigured' if self._worker is None else 'inactive'
-        reason = f'the node is {state}: {self._how_to()}'
+        reason = f'the node is {self.health.state.value}: {self._how_to()}'
         return Answer(LocalizationResult(Status.NOT_ACTIVE, reason), self.map_id)
 
     def _how_to(self) -> str:
         """What makes the node active."""
+        if self.health.state is State.FINALIZED:
+            return 'it was shut down; start its process again'
         states = ('activate',) if self._worker is not None else ('configure', 'activate')
         name = self.get_fully_qualified_name()
         return ' and '.join(f'`ros2 lifecycle set {name} {state}`' for state in states)

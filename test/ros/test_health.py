@@ -347,6 +347,9 @@ def test_states_that_localize_nothing_are_warnings() -> None:
     robot.health.unloaded()
     assert robot.found() == {Condition.UNCONFIGURED}
     assert robot.health.state is State.UNCONFIGURED
+    robot.activate()
+    robot.health.shut_down()
+    assert robot.found() == {Condition.FINALIZED}
 
 
 def test_a_map_that_cannot_be_loaded_is_an_error_until_one_is(robot: Simulated) -> None:

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     import pycolmap
     from geometry_msgs.msg import Pose
     from numpy.typing import NDArray
+    from rclpy.client import Client
     from rclpy.node import Node
     from tiny_place import TinyPlace
 
@@ -164,6 +165,7 @@ class Robot:
         namespace: str = '',
         pose_topic: str = '/relocalized_pose',
         image_topic: str = 'image',
+        base_frame: str = 'base_link',
     ) -> None:
         """Publishes nothing yet.
 
@@ -172,6 +174,7 @@ class Robot:
             namespace: That of the relocalizer, whose `image` and the like are relative to it.
             pose_topic: What `/relocalized_pose` is remapped to.
             image_topic: What `image` is remapped to, in that namespace.
+            base_frame: That the camera is mounted on.
         """
         self.node = node
         self.heard = Heard()
@@ -181,6 +184,7 @@ class Robot:
         self._namespace = namespace
         self._pose_topic = pose_topic
         self._image_topic = f'{namespace}/{image_topic}'
+        self._base_frame = base_frame
         self._tf_static = node.create_publisher(TFMessage, f'{namespace}/tf_static', LATCHED)
         self._compressed = node.create_publisher(CompressedImage, '/front/image/compressed', 1)
         self._switch_camera_on()
@@ -232,7 +236,7 @@ class Robot:
         transform = Transform(
             translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw)
         )
-        header = Header(frame_id='base_link')
+        header = Header(frame_id=self._base_frame)
         self._tf_static.publish(
             TFMessage(
                 transforms=[
@@ -324,12 +328,25 @@ class Robot:
         patience: float = PATIENCE_S,
         meanwhile: Callable[[], None] = lambda: None,
     ) -> Any:  # noqa: ANN401 - a response
+        """The answer of a service to a client of its own; see `request`."""
+        client = self.node.create_client(kind, name)
+        answer = self.request(client, request, patience, meanwhile)
+        self.node.destroy_client(client)
+        return answer
+
+    @staticmethod
+    def request(
+        client: Client,
+        request: object,
+        patience: float = PATIENCE_S,
+        meanwhile: Callable[[], None] = lambda: None,
+    ) -> Any:  # noqa: ANN401 - a response
         """The answer; asked again, as DDS can lose a request while both ends find each other.
 
-        `meanwhile` is called again and again until then.
+        `meanwhile` is called again and again until then. The next request of this client will not
+        be lost, and the one before has been taken.
         """
-        client = self.node.create_client(kind, name)
-        assert client.wait_for_service(LIMIT_S), name
+        assert client.wait_for_service(LIMIT_S), client.srv_name
         asked = time.monotonic()
         futures = [client.call_async(request)]
 
@@ -341,9 +358,7 @@ class Robot:
             meanwhile()
             return next((future for future in futures if future.done()), None)
 
-        future = wait_for(answered, name)
-        self.node.destroy_client(client)
-        return future.result()
+        return wait_for(answered, client.srv_name).result()
 
 
 def _of_stamp(messages: list[T], stamp: Time) -> T | None:
@@ -420,7 +435,7 @@ def running_node(
         node_process(log, '--map', str(tiny_place.map_path), **options) as node,
         spinning_node('robot') as own,
     ):
-        robot = Robot(own)
+        robot = Robot(own, base_frame=options.get('base_frame', 'base_link'))
         robot.mount_camera()
         robot.connect(node)
         robot.camera_info = camera_info(tiny_place.camera)

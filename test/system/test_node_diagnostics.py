@@ -4,13 +4,13 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
+from doctor import PARTS, Doctor
 from lifecycle_msgs.msg import Transition
 from live_robot import NODE, NodeProcess, Robot, camera_info, image_message, spinning_node, wait_for
 from nav_msgs.msg import Odometry
@@ -22,46 +22,13 @@ from gam_relocalizer.scene_map import load_map
 from gam_relocalizer_msgs.srv import LoadMap
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
     from tiny_place import TinyPlace
 
-PARTS = [one.name for one in diagnose(Health())]
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-
-
-class Doctor:
-    """Listens to what the node says about itself."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.heard: list[DiagnosticArray] = []
-        robot.node.create_subscription(DiagnosticArray, '/diagnostics', self.heard.append, 100)
-
-    def report(self, part: str) -> DiagnosticStatus | None:
-        """The newest one about a part."""
-        name = f'{NODE.lstrip("/")}: {part}'
-        newest = self.heard[-1].status if self.heard else []
-        return next((status for status in newest if status.name == name), None)
-
-    def value(self, part: str, key: str) -> str:
-        report = self.report(part)
-        assert report is not None
-        return next(pair.value for pair in report.values if pair.key == key)
-
-    def wait_for(self, part: str, condition: Condition) -> DiagnosticStatus:
-        def found() -> DiagnosticStatus | None:
-            report = self.report(part)
-            return report if report and f'{condition.name}: ' in report.message else None
-
-        report = wait_for(found, f'{condition.name}')
-        assert report.level == bytes([condition.level.value])
-        return report
-
-    def levels(self) -> dict[str, bytes]:
-        reports = {part: self.report(part) for part in PARTS}
-        return {part: report.level for part, report in reports.items() if report is not None}
 
 
 class Camera:
@@ -208,42 +175,6 @@ def test_odometry_of_another_body_is_a_warning(patient: Patient) -> None:
     patient.robot.node.destroy_timer(timer)
     patient.robot.node.destroy_publisher(publisher)
     assert '`trailer`' in report.message
-
-
-def test_every_state_has_its_report(
-    start_node: Callable[..., NodeProcess], robot: Robot, tiny_place: TinyPlace, tmp_path: Path
-) -> None:
-    damaged = tmp_path / 'damaged_map'
-    shutil.copytree(tiny_place.map_path, damaged)
-    with (damaged / 'points.npy').open('r+b') as file:
-        file.truncate(1000)
-    doctor = Doctor(robot)
-    node = start_node('--map', str(damaged), publish_map_odom=True)
-    report = doctor.wait_for('state', Condition.TRANSITION_FAILED)
-    assert 'points.npy' in report.message
-    assert doctor.levels() == dict.fromkeys(PARTS, OK) | {'state': ERROR}
-    assert robot.set_parameter('map', str(tiny_place.map_path)) == (True, '')
-    assert robot.change_state(Transition.TRANSITION_CONFIGURE)
-    doctor.wait_for('state', Condition.INACTIVE)
-    assert doctor.levels() == dict.fromkeys(PARTS, OK) | {'state': WARN}
-    assert robot.change_state(Transition.TRANSITION_ACTIVATE)
-    wait_for(lambda: doctor.levels()['state'] == OK, 'the node to say that it is active')
-    report = doctor.wait_for('map_to_odom', Condition.BROADCAST_BLOCKED)
-    assert '/odom' in report.message
-    assert robot.change_state(Transition.TRANSITION_DEACTIVATE)
-    assert robot.change_state(Transition.TRANSITION_CLEANUP)
-    doctor.wait_for('state', Condition.UNCONFIGURED)
-    assert node.stop() == 0, node.log
-
-
-def test_a_clock_that_never_begins_does_not_silence_the_node_but_is_an_error(
-    start_node: Callable[..., NodeProcess], robot: Robot, tiny_place: TinyPlace
-) -> None:
-    doctor = Doctor(robot)
-    node = start_node('--map', str(tiny_place.map_path), use_sim_time=True)
-    doctor.wait_for('input', Condition.NO_CLOCK)
-    assert doctor.levels()['state'] == OK
-    assert node.stop() == 0, node.log
 
 
 def test_messages_and_core_number_the_levels_alike() -> None:

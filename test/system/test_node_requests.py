@@ -7,11 +7,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration
+from doctor import Doctor
 from lifecycle_msgs.msg import Transition
 from live_robot import LIMIT_S, NODE, NodeProcess, Robot, camera_info, image_message, wait_for
 from std_srvs.srv import SetBool
 
 from gam_relocalizer.localization.result import Status
+from gam_relocalizer.ros.conditions import Condition
 from gam_relocalizer_msgs.srv import LoadMap, LocalizeImage, Relocalize
 
 if TYPE_CHECKING:
@@ -48,6 +50,28 @@ def test_a_node_that_is_not_active_says_what_to_do(
     assert node.stop() == 0, node.log
 
 
+def test_a_node_that_was_shut_down_refuses_every_request_and_says_so(
+    start_node: Callable[..., NodeProcess], robot: Robot, tiny_place: TinyPlace
+) -> None:
+    node = start_node('--map', str(tiny_place.map_path))
+    doctor = Doctor(robot)
+    robot.connect(node)
+    assert robot.change_state(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert robot.state() == 'finalized'
+    robot.wait_until_alone()
+    for kind, name in ((Relocalize, 'relocalize'), (LocalizeImage, 'localize_image')):
+        answer = robot.call(kind, f'{NODE}/{name}', kind.Request())
+        assert Status(answer.status.status) is Status.NOT_ACTIVE
+        assert 'finalized' in answer.status.reason
+    refused = load_map(robot, tiny_place.map_path)
+    assert (refused.success, refused.map_id) == (False, '')
+    assert 'finalized' in refused.message
+    assert not robot.call(SetBool, f'{NODE}/set_enabled', SetBool.Request(data=True)).success
+    doctor.wait_for('state', Condition.FINALIZED)
+    assert doctor.value('state', 'state') == 'finalized'
+    node.end_cleanly()
+
+
 def test_a_map_makes_a_node_start_that_had_none(
     start_node: Callable[..., NodeProcess], robot: Robot, tiny_place: TinyPlace, tmp_path: Path
 ) -> None:
@@ -70,10 +94,9 @@ def test_requests_that_wait_are_answered_when_the_node_is_deactivated(
     node = start_node('--map', str(tiny_place.map_path))
     robot.connect(node)
     client = robot.node.create_client(Relocalize, f'{NODE}/relocalize')
-    assert client.wait_for_service(LIMIT_S)
-    robot.call(Relocalize, f'{NODE}/relocalize', AT_ONCE)
+    robot.request(client, AT_ONCE)
     waiting = client.call_async(Relocalize.Request(timeout=Duration(sec=300)))
-    robot.call(Relocalize, f'{NODE}/relocalize', AT_ONCE)
+    robot.request(client, AT_ONCE)
     assert not waiting.done()
     assert robot.change_state(Transition.TRANSITION_DEACTIVATE)
     wait_for(waiting.done, 'an answer')
@@ -98,16 +121,3 @@ def test_images_without_a_calibration_are_named_as_what_is_missing(
     assert Status(answer.status.status) is Status.NO_CALIBRATION
     assert '/camera_info' in answer.status.reason
     assert node.stop() == 0, node.log
-
-
-def test_a_signal_while_a_request_waits_ends_the_node_cleanly(
-    start_node: Callable[..., NodeProcess], robot: Robot, tiny_place: TinyPlace
-) -> None:
-    node = start_node('--map', str(tiny_place.map_path))
-    robot.connect(node)
-    client = robot.node.create_client(Relocalize, f'{NODE}/relocalize')
-    assert client.wait_for_service(LIMIT_S)
-    client.call_async(Relocalize.Request(timeout=Duration(sec=300)))
-    robot.call(Relocalize, f'{NODE}/relocalize', AT_ONCE)
-    assert node.stop() == 0, node.log
-    assert 'Traceback' not in node.log
