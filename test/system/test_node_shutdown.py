@@ -4,13 +4,24 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
 from signal import SIGINT, SIGTERM, Signals
 from typing import TYPE_CHECKING
 
 import pytest
 from builtin_interfaces.msg import Duration
 from lifecycle_msgs.msg import Transition, TransitionEvent
-from live_robot import LIMIT_S, NodeProcess, Robot, camera_info, image_message, wait_for
+from live_robot import (
+    LIMIT_S,
+    REPOSITORY,
+    NodeProcess,
+    Robot,
+    camera_info,
+    image_message,
+    wait_for,
+)
 
 from gam_relocalizer_msgs.srv import LoadMap, LocalizeImage, Relocalize
 
@@ -113,3 +124,15 @@ def unanswerable(kind: type) -> object:
     if kind is Relocalize:
         request.timeout = Duration(nanosec=1)
     return request
+
+
+@pytest.mark.parametrize('library', ['numpy', 'pycolmap', 'torch'])
+@pytest.mark.parametrize('number', [SIGINT, SIGTERM])
+def test_a_signal_while_it_starts_ends_the_node_quietly(library: str, number: Signals) -> None:
+    command = [sys.executable, str(REPOSITORY / 'scripts' / 'node')]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    loaded = Path(f'/proc/{process.pid}/maps')
+    wait_for(lambda: library in loaded.read_text(encoding='utf-8'), library)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=LIMIT_S)
+    assert (process.returncode, 'Traceback' in said) == (0, False), said
