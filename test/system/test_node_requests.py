@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Duration
@@ -84,7 +85,7 @@ def test_a_map_makes_a_node_start_that_had_none(
     assert robot.state() == 'active'
     robot.camera_info = camera_info(tiny_place.camera)
     robot.connect(node)
-    assert robot.ask(image_message(tiny_place.queries[0][0], 1.0)).accepted
+    robot.wait_for_first_fix(tiny_place.queries[0][0], count(1.0))
     assert node.stop() == 0, node.log
 
 
