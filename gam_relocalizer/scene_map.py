@@ -126,6 +126,7 @@ class Manifest:
         format_version: Version of this layout.
         retrieval_weights_sha256: Sum of the weights of the global descriptor, or empty when it has
             none.
+        alignment: How the frame was found and how well it fits; empty when nobody aligned the map.
     """
 
     extractor: ExtractorIdentity
@@ -136,6 +137,7 @@ class Manifest:
     files: Mapping[str, FileEntry] = field(default_factory=dict)
     format_version: int = FORMAT_VERSION
     retrieval_weights_sha256: str = ''
+    alignment: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def map_id(self) -> str:
@@ -207,6 +209,18 @@ class SceneMap:
         """Indices of the points that a reference image observes (the paper's meta scene)."""
         begin, end = self.observation_offsets[image : image + 2]
         return self.observation_points[begin:end]
+
+    def positions_of(self, points: NDArray[np.integer]) -> NDArray[np.float64]:
+        """[K,3] places of some points [K], map frame."""
+        return np.asarray(self.points[points], np.float64)
+
+    def descriptors_of(self, points: NDArray[np.integer]) -> NDArray[np.float32]:
+        """[K,D] mean descriptors of some points [K], of length one."""
+        return np.asarray(self.descriptors[points], np.float32)
+
+    def likeness(self, global_descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
+        """[I] how much each reference image looks like a query [G]: the cosine of the two."""
+        return np.asarray(self.global_descriptors @ global_descriptor, np.float32)
 
     @cached_property
     def camera_positions(self) -> NDArray[np.float64]:
@@ -303,6 +317,40 @@ def load_map(path: Path) -> SceneMap:
     return scene_map
 
 
+def load_content(path: Path) -> tuple[Manifest, MapContent]:
+    """All that `save_map` wants of a bundle, in its SfM frame: to write a changed one.
+
+    Raises:
+        MapError: As `load_map`.
+    """
+    scene_map = load_map(path)
+    sfm_from_map = scene_map.manifest.frame.map_from_sfm.inverse()
+    content = MapContent(
+        image_names=scene_map.image_names,
+        camera_from_sfm=tuple(
+            sfm_from_map.transform_camera_world(pose) for pose in scene_map.camera_from_map
+        ),
+        points=np.asarray(sfm_from_map * scene_map.points, np.float64),
+        descriptors=np.asarray(scene_map.descriptors, np.float32),
+        observation_offsets=scene_map.observation_offsets,
+        observation_points=scene_map.observation_points,
+        global_descriptors=scene_map.global_descriptors,
+        codebook=scene_map.codebook,
+    )
+    return scene_map.manifest, content
+
+
+def save_frame(path: Path, frame: MapFrame, alignment: Mapping[str, Any]) -> Manifest:
+    """Lays a bundle into another frame; nothing but its manifest is written.
+
+    Raises:
+        MapError: As `read_manifest`.
+    """
+    manifest = replace(read_manifest(path), frame=frame, alignment=alignment)
+    _write_manifest(path, manifest)
+    return manifest
+
+
 def read_manifest(path: Path) -> Manifest:
     """Reads and checks manifest.yaml alone.
 
@@ -389,8 +437,12 @@ def _write_bundle(
             if file.is_file()
         },
     )
-    write_text(folder / MANIFEST, yaml.safe_dump(_plain(asdict(complete)), sort_keys=False))
+    _write_manifest(folder, complete)
     return complete
+
+
+def _write_manifest(folder: Path, manifest: Manifest) -> None:
+    write_text(folder / MANIFEST, yaml.safe_dump(_plain(asdict(manifest)), sort_keys=False))
 
 
 def _replace_directory(source: Path, target: Path) -> None:
@@ -435,6 +487,7 @@ def _manifest_from(data: Mapping[str, Any]) -> Manifest:
         files=files,
         # maps of releases that knew VLAD alone do not have it
         retrieval_weights_sha256=str(data.get('retrieval_weights_sha256', '')),
+        alignment=dict(data.get('alignment', {})),
     )
 
 

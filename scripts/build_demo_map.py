@@ -17,6 +17,7 @@ from gam_relocalizer.cameras import parse_camera
 from gam_relocalizer.demo.recording import record_mapping_pass
 from gam_relocalizer.demo.world import demo_world
 from gam_relocalizer.geometry import read_poses
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 
 DEFAULT_OUT = Path(__file__).resolve().parents[1] / 'maps' / 'demo'
@@ -39,12 +40,13 @@ def main() -> None:
         record_mapping_pass(
             demo_world(), walk, progress=lambda done, total: show('render', done, total)
         )
-        options = MapBuildOptions(
-            camera=parse_camera(walk / 'camera.txt'),
-            poses=read_poses(walk / 'poses.txt'),
-            max_keypoints=MAX_KEYPOINTS,
+        images = ImageSet.of_folder(
+            walk / 'images',
+            parse_camera(walk / 'camera.txt'),
+            read_poses(walk / 'poses.txt'),
         )
-        report = build_map(walk / 'images', out, options, show)
+        options = MapBuildOptions(max_keypoints=MAX_KEYPOINTS)
+        report = build_map(images, out, options, show)
     size = sum(file.stat().st_size for file in out.rglob('*') if file.is_file())
     print(
         f'{out}: {report.images_registered} of {report.images_given} images, {report.points} '

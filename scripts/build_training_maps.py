@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 
 from gam_relocalizer.errors import UsageError
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 
 VIDEOS = ('ditch_02', 'drone_park_01', 'holiday_display_01', 'stone_sign', 'tree_snow_01')
@@ -33,7 +34,7 @@ def main() -> None:
     for extractor in EXTRACTORS:
         for name in VIDEOS:
             frames, out = arguments.out / 'frames' / name, arguments.out / f'{name}-{extractor}'
-            build_map(frames, out, MapBuildOptions(extractor=extractor))
+            build_map(ImageSet.of_folder(frames), out, MapBuildOptions(extractor=extractor))
             print(f'--map {out} --images {frames}', flush=True)
 
 

@@ -30,6 +30,7 @@ from gam_relocalizer.evaluation.calibration import normalised_error_squared, sum
 from gam_relocalizer.evaluation.metrics import Threshold
 from gam_relocalizer.features.registry import create_extractor, global_descriptor_of
 from gam_relocalizer.geometry import pose_error, read_poses, write_poses
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.images import read_image
 from gam_relocalizer.localization.confidence import Evidence, scaled_residual
 from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
@@ -85,12 +86,13 @@ def _prepare(folder: Path, seed: int) -> None:
         record_mapping_pass(demo_world(seed), folder / 'walk')
     if not (folder / 'map').is_dir():
         walk = folder / 'walk'
-        options = MapBuildOptions(
-            camera=parse_camera(walk / 'camera.txt'),
-            poses=read_poses(walk / 'poses.txt'),
-            max_keypoints=MAX_KEYPOINTS,
+        images = ImageSet.of_folder(
+            walk / 'images',
+            parse_camera(walk / 'camera.txt'),
+            read_poses(walk / 'poses.txt'),
         )
-        build_map(walk / 'images', folder / 'map', options)
+        options = MapBuildOptions(max_keypoints=MAX_KEYPOINTS)
+        build_map(images, folder / 'map', options)
     if (folder / 'poses_query.txt').is_file():
         return
     world = demo_world(seed, rearranged=True)

@@ -16,7 +16,8 @@ from gam_relocalizer.demo.recording import (
 )
 from gam_relocalizer.demo.world import tiny_world
 from gam_relocalizer.geometry import read_poses
-from gam_relocalizer.mapping.build import MapBuildOptions, build_map
+from gam_relocalizer.image_set import ImageSet
+from gam_relocalizer.mapping.build import build_map
 from gam_relocalizer.replay.bag import open_bag
 from gam_relocalizer.replay.messages import image_in
 
@@ -53,10 +54,12 @@ def make_tiny_place(folder: Path) -> TinyPlace:
     world = tiny_world()
     recording, map_path, bag = folder / 'mapping', folder / 'map', folder / 'drive'
     record_mapping_pass(world, recording, workers=1)
-    options = MapBuildOptions(
-        camera=parse_camera(recording / 'camera.txt'), poses=read_poses(recording / 'poses.txt')
+    images = ImageSet.of_folder(
+        recording / 'images',
+        parse_camera(recording / 'camera.txt'),
+        read_poses(recording / 'poses.txt'),
     )
-    build_map(recording / 'images', map_path, options)
+    build_map(images, map_path)
     record_query_bag(world, bag, duration_s=DRIVE_S, workers=1)
     drive = trajectories.drive(world.drive_route)
     with open_bag(bag) as messages:

@@ -24,7 +24,6 @@ from gam_relocalizer.features.registry import (
     load_global_descriptor,
 )
 from gam_relocalizer.features.vlad import Vlad
-from gam_relocalizer.images import list_images
 from gam_relocalizer.mapping.descriptors import describe_points
 from gam_relocalizer.mapping.extraction import extract_images
 from gam_relocalizer.mapping.intrinsics import assign_cameras
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
 
     from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor
+    from gam_relocalizer.image_set import ImageSet
     from gam_relocalizer.mapping.extraction import ExtractedImages, MappingImage
     from gam_relocalizer.mapping.progress import Progress
 
@@ -69,10 +69,7 @@ class MapBuildOptions:
     """What a build can be told.
 
     Attributes:
-        camera: Of all images; guessed and refined when not given.
-        poses: Image name to camera_from_world; the map then lies in their frame and scale.
-        poses_are_metric: Whether one unit of the poses is a metre.
-        refine_camera: Refine the given camera as well.
+        refine_camera: Refine the given cameras as well.
         extractor: Name of the local features.
         max_keypoints: Features per image.
         mapper: `incremental` or `global` structure from motion; unused with poses.
@@ -80,9 +77,6 @@ class MapBuildOptions:
         global_weights: Weights file of the global descriptor, when it needs one.
     """
 
-    camera: pycolmap.Camera | None = None
-    poses: Mapping[str, pycolmap.Rigid3d] | None = None
-    poses_are_metric: bool = True
     refine_camera: bool = False
     extractor: str = DEFAULT_EXTRACTOR
     max_keypoints: int = DEFAULT_MAX_KEYPOINTS
@@ -111,47 +105,50 @@ class _Retrieval:
 
 
 def build_map(
-    images: Path, out: Path, options: MapBuildOptions, progress: Progress = ignore_progress
+    images: ImageSet,
+    out: Path,
+    options: MapBuildOptions | None = None,
+    progress: Progress = ignore_progress,
 ) -> BuildReport:
     """Builds a map bundle; the same images and options give the same map.
 
     Args:
-        images: Folder of images, searched with its sub-folders.
+        images: What is to be mapped; with poses the map lies in their frame and scale.
         out: The bundle; an existing bundle is replaced once the new one is complete.
         options: See there.
         progress: Told of the steps extract, match, verify, sfm and save.
 
     Raises:
-        UsageError: No images, unknown extractor, global descriptor or mapper, weights missing or
-            not needed, or a camera that does not fit.
+        UsageError: Unknown extractor, global descriptor or mapper, weights missing or not needed,
+            or a camera that does not fit.
         WeightsError: Weights of the local or global descriptor are missing or damaged.
         PosesFileError: The poses name none of the images.
         MapError: `out` exists and is not a map bundle, or cannot be written.
         MapBuildError: The images do not make a map; the message says why and what to do.
     """
+    options = options or MapBuildOptions()
     _check_output(out)
     if options.mapper not in MAPPERS:
         msg = f'unknown mapper `{options.mapper}`; known are {", ".join(MAPPERS)}'
         raise UsageError(msg)
     extractor = create_extractor(options.extractor, options.max_keypoints)
     describer = load_global_descriptor(options.global_descriptor, options.global_weights)
-    given = list_images(images)
-    _check_names(given)
-    wanted = _with_pose(given, options.poses)
+    _check_names(images.names)
+    wanted = _with_pose(images.names, images.camera_from_world)
     timer = StepTimer()
     with timer.step('extract'):
-        extracted = extract_images(images, wanted, extractor, describer, progress)
-    _check_usable(extracted, images)
-    cameras = assign_cameras(images, extracted.images, options.camera)
+        extracted = extract_images(images.folder, wanted, extractor, describer, progress)
+    _check_usable(extracted, images.folder)
+    cameras = assign_cameras(images, extracted.images)
     with timer.step('match'):
         retrieval = _describe_images(extracted.images, describer)
         matches = _match(extracted.images, retrieval, options, progress)
-    camera_is_known = options.camera is not None and not options.refine_camera
-    sfm_input = SfmInput(extracted.images, cameras, camera_is_known, matches)
-    model = _reconstruct(sfm_input, options, timer, progress)
+    constant = frozenset() if options.refine_camera else cameras.given
+    sfm_input = SfmInput(extracted.images, cameras, constant, matches, images.camera_from_world)
+    model = _reconstruct(sfm_input, options.mapper, timer, progress)
     with timer.step('describe'):
         content = _content(model.reconstruction, extracted.images, retrieval)
-    report = _report(given, wanted, extracted, model, content, timer)
+    report = _report(images.names, wanted, extracted, model, content, timer)
     progress('save', 0, 1)
     manifest = _manifest(images, extractor, retrieval.describer, options, report)
     save_map(out, content, manifest, model.reconstruction)
@@ -239,9 +236,7 @@ def _match(
     return matches
 
 
-def _reconstruct(
-    sfm_input: SfmInput, options: MapBuildOptions, timer: StepTimer, progress: Progress
-) -> _Model:
+def _reconstruct(sfm_input: SfmInput, mapper: str, timer: StepTimer, progress: Progress) -> _Model:
     """Runs structure from motion in a temporary folder."""
     with tempfile.TemporaryDirectory(prefix='map_build_') as folder, quiet_colmap():
         work = Path(folder)
@@ -253,10 +248,10 @@ def _reconstruct(
         progress('verify', 1, 1)
         progress('sfm', 0, len(sfm_input.images))
         with timer.step('sfm'):
-            models = _models(database, work, sfm_input, options, progress)
+            models = _models(database, work, sfm_input, mapper, progress)
         progress('sfm', len(sfm_input.images), len(sfm_input.images))
     largest = models[0] if models else pycolmap.Reconstruction()
-    _check_model(largest, sfm_input, verified, options)
+    _check_model(largest, sfm_input, verified)
     return _Model(
         reconstruction=largest,
         other_models=tuple(model.num_reg_images() for model in models[1:]),
@@ -269,22 +264,19 @@ def _models(
     database: Path,
     work: Path,
     sfm_input: SfmInput,
-    options: MapBuildOptions,
+    mapper: str,
     progress: Progress,
 ) -> list[pycolmap.Reconstruction]:
-    if options.poses is None:
-        return map_images(database, work, sfm_input, options.mapper, progress)
-    camera_from_world = [options.poses[image.name] for image in sfm_input.images]
-    return [triangulate(database, work, sfm_input, camera_from_world)]
+    if sfm_input.camera_from_world is None:
+        return map_images(database, work, sfm_input, mapper, progress)
+    return [triangulate(database, work, sfm_input, sfm_input.camera_from_world)]
 
 
 def _images_with_points(model: pycolmap.Reconstruction) -> int:
     return sum(image.has_pose and image.num_points3D > 0 for image in model.images.values())
 
 
-def _check_model(
-    model: pycolmap.Reconstruction, sfm_input: SfmInput, verified: int, options: MapBuildOptions
-) -> None:
+def _check_model(model: pycolmap.Reconstruction, sfm_input: SfmInput, verified: int) -> None:
     """Refuses what is no map, with what to do about it.
 
     Raises:
@@ -300,7 +292,7 @@ def _check_model(
     advice = (
         'take more images, overlapping by two thirds, from different positions, of surfaces with '
         'texture'
-        if options.poses is None
+        if sfm_input.camera_from_world is None
         else 'check the camera, and that the poses are camera_from_world as COLMAP has it'
     )
     msg = (
@@ -359,15 +351,15 @@ def _report(
 
 
 def _manifest(
-    images: Path,
+    images: ImageSet,
     extractor: LocalExtractor,
     describer: GlobalDescriptor,
     options: MapBuildOptions,
     report: BuildReport,
 ) -> Manifest:
     frame = MapFrame()
-    if options.poses is not None:
-        frame = MapFrame(metric=options.poses_are_metric, source='the given camera poses')
+    if images.camera_from_world is not None:
+        frame = MapFrame(metric=images.metric, source='the given camera poses')
     return Manifest(
         extractor=extractor.identity,
         retrieval=describer.name,
@@ -375,10 +367,12 @@ def _manifest(
         frame=frame,
         counts={},
         build={
-            'images': images.absolute().name,
+            'images': images.folder.absolute().name,
             'options': {
-                'camera': None if options.camera is None else format_camera(options.camera),
-                'poses': None if options.poses is None else len(options.poses),
+                'cameras': sorted({format_camera(one) for one in images.cameras.values()}),
+                'poses': None
+                if images.camera_from_world is None
+                else len(images.camera_from_world),
                 'refine_camera': options.refine_camera,
                 'max_keypoints': options.max_keypoints,
                 'mapper': options.mapper,

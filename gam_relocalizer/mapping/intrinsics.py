@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 
 import pycolmap
 
+from gam_relocalizer.cameras import format_camera
 from gam_relocalizer.errors import CameraError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from gam_relocalizer.image_set import ImageSet
     from gam_relocalizer.mapping.extraction import MappingImage
 
 _GUESSED_MODEL = 'SIMPLE_RADIAL'
@@ -28,50 +30,51 @@ class ImageCameras:
     Attributes:
         cameras: With ids 1, 2, ...
         of_image: Index into `cameras` for each image.
+        given: Ids of those that were given, not guessed.
     """
 
     cameras: tuple[pycolmap.Camera, ...]
     of_image: tuple[int, ...]
+    given: frozenset[int] = frozenset()
 
     def of(self, image: int) -> pycolmap.Camera:
         """The camera that took an image."""
         return self.cameras[self.of_image[image]]
 
 
-def assign_cameras(
-    folder: Path, images: Sequence[MappingImage], camera: pycolmap.Camera | None
-) -> ImageCameras:
-    """The given camera for all, or one guessed camera per image size and EXIF focal length.
+def assign_cameras(images: ImageSet, extracted: Sequence[MappingImage]) -> ImageCameras:
+    """The given cameras, and else one guessed camera per image size and EXIF focal length.
 
     Raises:
-        CameraError: An image is not of the given camera's size.
+        CameraError: An image is not of its given camera's size.
     """
-    if camera is not None:
-        _check_sizes(images, camera)
-        known = _numbered(camera, 1)
-        known.has_prior_focal_length = True
-        return ImageCameras((known,), (0,) * len(images))
-    index_of: dict[tuple[float, ...], int] = {}
+    index_of: dict[str, int] = {}
     cameras: list[pycolmap.Camera] = []
     of_image: list[int] = []
-    for image in images:
-        guess = _guessed_camera(folder / image.name, image)
-        key = (guess.width, guess.height, *guess.params)
+    given: set[int] = set()
+    for image in extracted:
+        known = images.cameras.get(image.name)
+        camera = known or _guessed_camera(images.folder / image.name, image)
+        # a guess that happens to equal a given camera is still another one, to be refined
+        key = f'{known is not None} {format_camera(camera)}'
         if key not in index_of:
             index_of[key] = len(cameras)
-            cameras.append(_numbered(guess, len(cameras) + 1))
+            cameras.append(_numbered(camera, len(cameras) + 1))
         of_image.append(index_of[key])
-    return ImageCameras(tuple(cameras), tuple(of_image))
+        if known is not None:
+            _check_size(image, known)
+            cameras[index_of[key]].has_prior_focal_length = True
+            given.add(cameras[index_of[key]].camera_id)
+    return ImageCameras(tuple(cameras), tuple(of_image), frozenset(given))
 
 
-def _check_sizes(images: Sequence[MappingImage], camera: pycolmap.Camera) -> None:
-    for image in images:
-        if (image.width, image.height) != (camera.width, camera.height):
-            msg = (
-                f'{image.name}: {image.width} x {image.height} pixels, but the camera is '
-                f'{camera.width} x {camera.height}; give images of one camera, or no camera'
-            )
-            raise CameraError(msg)
+def _check_size(image: MappingImage, camera: pycolmap.Camera) -> None:
+    if (image.width, image.height) != (camera.width, camera.height):
+        msg = (
+            f'{image.name}: {image.width} x {image.height} pixels, but the camera is '
+            f'{camera.width} x {camera.height}; give images of one camera, or no camera'
+        )
+        raise CameraError(msg)
 
 
 def _guessed_camera(path: Path, image: MappingImage) -> pycolmap.Camera:

@@ -41,14 +41,21 @@ class SfmInput:
     Attributes:
         images: Image i has COLMAP's id i + 1.
         cameras: Of these images.
-        camera_is_known: Whether intrinsics are kept as they are.
+        constant_cameras: Ids of the cameras whose intrinsics are kept as they are.
         matches: (first, second) image index to [K,2] keypoint indices.
+        camera_from_world: By name of image, where all poses are known.
     """
 
     images: Sequence[MappingImage]
     cameras: ImageCameras
-    camera_is_known: bool
+    constant_cameras: frozenset[int]
     matches: Mapping[tuple[int, int], NDArray[np.int64]]
+    camera_from_world: Mapping[str, pycolmap.Rigid3d] | None = None
+
+    @property
+    def all_cameras_constant(self) -> bool:
+        """Whether nothing is left to be calibrated."""
+        return len(self.constant_cameras) == len(self.cameras.cameras)
 
 
 def image_id_of(index: int) -> int:
@@ -133,7 +140,7 @@ def triangulate(
     database_path: Path,
     work: Path,
     sfm_input: SfmInput,
-    camera_from_world: Sequence[pycolmap.Rigid3d],
+    camera_from_world: Mapping[str, pycolmap.Rigid3d],
 ) -> pycolmap.Reconstruction:
     """Points from images with known poses; the model lies in the frame and scale of the poses."""
     pycolmap.set_random_seed(_SEED)
@@ -142,7 +149,7 @@ def triangulate(
         model.add_camera_with_trivial_rig(camera)
     for index, image in enumerate(sfm_input.images):
         model.add_image_with_trivial_frame(
-            _colmap_image(index, image, sfm_input), camera_from_world[index]
+            _colmap_image(index, image, sfm_input), camera_from_world[image.name]
         )
     options = pycolmap.IncrementalPipelineOptions()
     _set_incremental_options(options, sfm_input)
@@ -152,7 +159,7 @@ def triangulate(
         work,
         work,
         options=options,
-        refine_intrinsics=not sfm_input.camera_is_known,
+        refine_intrinsics=not sfm_input.all_cameras_constant,
     )
 
 
@@ -177,7 +184,7 @@ def _map_incrementally(
 def _map_globally(
     database_path: Path, work: Path, sfm_input: SfmInput
 ) -> list[pycolmap.Reconstruction]:
-    if not sfm_input.camera_is_known:
+    if not sfm_input.all_cameras_constant:
         calibration = pycolmap.ViewGraphCalibrationOptions()
         calibration.random_seed = _SEED
         pycolmap.calibrate_view_graph(database_path, calibration)
@@ -185,8 +192,8 @@ def _map_globally(
     options.random_seed = options.mapper.random_seed = _SEED
     options.num_threads = options.mapper.num_threads = _THREADS
     adjustment = options.mapper.bundle_adjustment
-    adjustment.refine_focal_length = not sfm_input.camera_is_known
-    adjustment.refine_extra_params = not sfm_input.camera_is_known
+    adjustment.refine_focal_length = not sfm_input.all_cameras_constant
+    adjustment.refine_extra_params = not sfm_input.all_cameras_constant
     return list(pycolmap.global_mapping(database_path, work, work, options).values())
 
 
@@ -197,8 +204,7 @@ def _set_incremental_options(
     options.num_threads = _THREADS
     options.min_model_size = MIN_IMAGES
     options.extract_colors = False
-    if sfm_input.camera_is_known:
-        options.constant_cameras = {camera.camera_id for camera in sfm_input.cameras.cameras}
+    options.constant_cameras = set(sfm_input.constant_cameras)
 
 
 def _write_image(

@@ -29,6 +29,7 @@ from gam_relocalizer.errors import (
 from gam_relocalizer.evaluation.localization_report import DEFAULT_MATCHERS
 from gam_relocalizer.evaluation.matching import TRUE_CANDIDATES
 from gam_relocalizer.geometry import write_poses
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 from gam_relocalizer.scene_map import SFM, MapContent, load_map, save_map
 
@@ -56,8 +57,8 @@ class Corner:
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Corner:
     folder = tmp_path_factory.mktemp('evaluate')
     poses = write_room_images(folder / 'images', count=4)
-    options = MapBuildOptions(camera=CAMERA, poses=poses, poses_are_metric=False, max_keypoints=300)
-    build_map(folder / 'images', folder / 'corner', options)
+    images = ImageSet.of_folder(folder / 'images', CAMERA, poses, metric=False)
+    build_map(images, folder / 'corner', MapBuildOptions(max_keypoints=300))
     return Corner(folder / 'corner', folder / 'images')
 
 

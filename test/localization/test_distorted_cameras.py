@@ -19,6 +19,7 @@ from gam_relocalizer.demo.recording import drive_appearance, mapping_appearance
 from gam_relocalizer.demo.renderer import Renderer
 from gam_relocalizer.demo.world import tiny_world
 from gam_relocalizer.geometry import pose_error, rigid3d_from_rotation
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 
@@ -139,8 +140,8 @@ def test_a_map_by_a_distorted_camera_localizes_its_images(
     for index, (name, view) in enumerate(poses.items()):
         image = mapping.render(view, index)
         cv2.imwrite(str(tmp_path / 'images' / name), image[..., ::-1])
-    options = MapBuildOptions(camera=camera, poses=poses, max_keypoints=KEYPOINTS)
-    report = build_map(tmp_path / 'images', tmp_path / 'map', options)
+    images = ImageSet.of_folder(tmp_path / 'images', camera, poses)
+    report = build_map(images, tmp_path / 'map', MapBuildOptions(max_keypoints=KEYPOINTS))
     assert report.images_registered >= 0.8 * len(views)
 
     driving = DistortingRenderer(room.in_the_evening, camera, yaws)

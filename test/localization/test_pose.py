@@ -120,9 +120,7 @@ def test_covariance_tells_the_true_spread(camera: pycolmap.Camera) -> None:
         )
         assert pose is not None
         errors.append(
-            normalised_error_squared(
-                pose.camera_from_map, trial.camera_from_map, pose.covariance
-            )
+            normalised_error_squared(pose.camera_from_map, trial.camera_from_map, pose.covariance)
         )
     low, high = chi2.ppf([0.025, 0.975], 6 * trials) / trials
     assert low <= np.mean(errors) <= high

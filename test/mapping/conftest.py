@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 from corner_room import CAMERA, write_room_images
 
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 
 if TYPE_CHECKING:
@@ -45,13 +46,13 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
 def posed_map(room: Room, tmp_path_factory: pytest.TempPathFactory) -> BuiltMap:
     """Built from images, camera and poses."""
     path = tmp_path_factory.mktemp('maps') / 'posed'
-    options = MapBuildOptions(camera=CAMERA, poses=room.poses, max_keypoints=600)
-    return BuiltMap(path, build_map(room.images, path, options))
+    images = ImageSet.of_folder(room.images, CAMERA, room.poses)
+    return BuiltMap(path, build_map(images, path, MapBuildOptions(max_keypoints=600)))
 
 
 @pytest.fixture(scope='session')
 def free_map(room: Room, tmp_path_factory: pytest.TempPathFactory) -> BuiltMap:
     """Built from images and camera alone."""
     path = tmp_path_factory.mktemp('maps') / 'free'
-    options = MapBuildOptions(camera=CAMERA, max_keypoints=600)
-    return BuiltMap(path, build_map(room.images, path, options))
+    images = ImageSet.of_folder(room.images, CAMERA)
+    return BuiltMap(path, build_map(images, path, MapBuildOptions(max_keypoints=600)))

@@ -22,6 +22,7 @@ from gam_relocalizer.errors import (
 )
 from gam_relocalizer.features import create_extractor
 from gam_relocalizer.geometry import pose_error, rigid3d_from
+from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
 from gam_relocalizer.scene_map import load_map
 
@@ -131,9 +132,9 @@ def test_same_images_same_map(
 ) -> None:
     first = posed_map if with_poses else free_map
     poses = room.poses if with_poses else None
-    options = MapBuildOptions(camera=CAMERA, poses=poses, max_keypoints=600)
+    images = ImageSet.of_folder(room.images, CAMERA, poses)
 
-    build_map(room.images, tmp_path / 'again', options)
+    build_map(images, tmp_path / 'again', MapBuildOptions(max_keypoints=600))
 
     assert (tmp_path / 'again' / 'points.npy').read_bytes() == (
         first.path / 'points.npy'
@@ -142,7 +143,9 @@ def test_same_images_same_map(
 
 
 def test_finds_the_focal_length_without_a_camera(room: Room, tmp_path: Path) -> None:
-    report = build_map(room.images, tmp_path / 'map', MapBuildOptions(max_keypoints=600))
+    report = build_map(
+        ImageSet.of_folder(room.images), tmp_path / 'map', MapBuildOptions(max_keypoints=600)
+    )
 
     (camera,) = report.cameras
     assert parse_camera(camera).mean_focal_length() == pytest.approx(340.0, rel=0.03)
@@ -150,17 +153,18 @@ def test_finds_the_focal_length_without_a_camera(room: Room, tmp_path: Path) -> 
 
 def test_refines_a_wrong_focal_length_with_given_poses(room: Room, tmp_path: Path) -> None:
     wrong = parse_camera('SIMPLE_PINHOLE 384 288 360 192 144')
-    options = MapBuildOptions(camera=wrong, poses=room.poses, refine_camera=True, max_keypoints=600)
+    images = ImageSet.of_folder(room.images, wrong, room.poses)
+    options = MapBuildOptions(refine_camera=True, max_keypoints=600)
 
-    report = build_map(room.images, tmp_path / 'map', options)
+    report = build_map(images, tmp_path / 'map', options)
 
     assert parse_camera(report.cameras[0]).mean_focal_length() == pytest.approx(340.0, rel=0.01)
 
 
 def test_global_mapper_recovers_the_poses(room: Room, tmp_path: Path) -> None:
-    options = MapBuildOptions(camera=CAMERA, mapper='global', max_keypoints=600)
+    options = MapBuildOptions(mapper='global', max_keypoints=600)
 
-    build_map(room.images, tmp_path / 'map', options)
+    build_map(ImageSet.of_folder(room.images, CAMERA), tmp_path / 'map', options)
 
     position, _ = aligned_errors(load_map(tmp_path / 'map'), room.poses)
     assert len(position) == len(room.poses)
@@ -168,9 +172,10 @@ def test_global_mapper_recovers_the_poses(room: Room, tmp_path: Path) -> None:
 
 
 def test_sift_makes_a_map(room: Room, tmp_path: Path) -> None:
-    options = MapBuildOptions(camera=CAMERA, poses=room.poses, extractor='sift', max_keypoints=600)
+    images = ImageSet.of_folder(room.images, CAMERA, room.poses)
+    options = MapBuildOptions(extractor='sift', max_keypoints=600)
 
-    build_map(room.images, tmp_path / 'map', options)
+    build_map(images, tmp_path / 'map', options)
 
     scene_map = load_map(tmp_path / 'map')
     assert scene_map.manifest.extractor.name == 'sift'
@@ -186,8 +191,11 @@ def test_names_what_was_left_out_and_why(room: Room, tmp_path: Path) -> None:
     poses = {**room.poses, 'broken.jpg': room.poses['view 00.png']}
     poses['black.png'] = poses['elsewhere.png'] = room.poses['view 01.png']
 
-    options = MapBuildOptions(camera=CAMERA, poses=poses, max_keypoints=600)
-    report = build_map(images, tmp_path / 'map', options)
+    report = build_map(
+        ImageSet.of_folder(images, CAMERA, poses),
+        tmp_path / 'map',
+        MapBuildOptions(max_keypoints=600),
+    )
 
     assert list(report.unreadable) == ['broken.jpg']
     assert report.without_pose == ('no pose.png',)
@@ -209,7 +217,7 @@ def test_unrelated_images_are_refused(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / 'images' / f'{seed}.png'), image)
 
     with pytest.raises(MapBuildError, match='10 image pairs'):
-        build_map(tmp_path / 'images', tmp_path / 'map', MapBuildOptions())
+        build_map(ImageSet.of_folder(tmp_path / 'images'), tmp_path / 'map')
     assert not (tmp_path / 'map').exists()
 
 
@@ -218,29 +226,29 @@ def test_too_few_images_are_refused(tmp_path: Path, count: int) -> None:
     write_noise(tmp_path / 'images', count)
 
     with pytest.raises(MapBuildError, match='at least 3'):
-        build_map(tmp_path / 'images', tmp_path / 'map', MapBuildOptions())
+        build_map(ImageSet.of_folder(tmp_path / 'images'), tmp_path / 'map')
 
 
 def test_poses_in_the_wrong_convention_are_refused(room: Room, tmp_path: Path) -> None:
     inverted = {name: pose.inverse() for name, pose in room.poses.items()}
-    options = MapBuildOptions(camera=CAMERA, poses=inverted, max_keypoints=600)
+    images = ImageSet.of_folder(room.images, CAMERA, inverted)
 
     with pytest.raises(MapBuildError, match='camera_from_world'):
-        build_map(room.images, tmp_path / 'map', options)
+        build_map(images, tmp_path / 'map', MapBuildOptions(max_keypoints=600))
 
 
 def test_poses_of_other_images_are_refused_before_any_work(room: Room, tmp_path: Path) -> None:
     poses = {'other.png': rigid3d_from([1, 0, 0, 0], [0, 0, 0])}
 
     with pytest.raises(PosesFileError, match=r'other\.png.*view 00\.png'):
-        build_map(room.images, tmp_path / 'map', MapBuildOptions(camera=CAMERA, poses=poses))
+        build_map(ImageSet.of_folder(room.images, CAMERA, poses), tmp_path / 'map')
 
 
 def test_camera_of_another_size_is_refused(room: Room, tmp_path: Path) -> None:
-    options = MapBuildOptions(camera=parse_camera('SIMPLE_PINHOLE 640 480 500 320 240'))
+    camera = parse_camera('SIMPLE_PINHOLE 640 480 500 320 240')
 
     with pytest.raises(CameraError, match='384 x 288'):
-        build_map(room.images, tmp_path / 'map', options)
+        build_map(ImageSet.of_folder(room.images, camera), tmp_path / 'map')
 
 
 def test_output_that_is_no_map_is_refused_before_any_work(room: Room, tmp_path: Path) -> None:
@@ -249,7 +257,7 @@ def test_output_that_is_no_map_is_refused_before_any_work(room: Room, tmp_path: 
 
     with pytest.raises(MapError):
         build_map(
-            room.images,
+            ImageSet.of_folder(room.images),
             tmp_path / 'photos',
             MapBuildOptions(),
             lambda step, done, total: steps.append(f'{step} {done} {total}'),
@@ -261,7 +269,7 @@ def test_output_below_a_file_is_refused(room: Room, tmp_path: Path) -> None:
     (tmp_path / 'file').touch()
 
     with pytest.raises(MapError):
-        build_map(room.images, tmp_path / 'file' / 'map', MapBuildOptions())
+        build_map(ImageSet.of_folder(room.images), tmp_path / 'file' / 'map')
 
 
 @pytest.mark.parametrize(
@@ -269,12 +277,12 @@ def test_output_below_a_file_is_refused(room: Room, tmp_path: Path) -> None:
 )
 def test_unknown_names_are_refused(room: Room, tmp_path: Path, options: MapBuildOptions) -> None:
     with pytest.raises(UsageError, match='magic'):
-        build_map(room.images, tmp_path / 'map', options)
+        build_map(ImageSet.of_folder(room.images), tmp_path / 'map', options)
 
 
 def test_folder_without_images_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError):
-        build_map(tmp_path, tmp_path / 'map', MapBuildOptions())
+        ImageSet.of_folder(tmp_path)
 
 
 @pytest.mark.parametrize('name', [b'#1.png', b'two\nlines.png', b'latin-\xe9.png'])
@@ -283,7 +291,7 @@ def test_names_that_a_poses_file_cannot_hold_are_refused(tmp_path: Path, name: b
     (tmp_path / 'images' / os.fsdecode(name)).touch()
 
     with pytest.raises(UsageError, match='rename'):
-        build_map(tmp_path / 'images', tmp_path / 'map', MapBuildOptions())
+        build_map(ImageSet.of_folder(tmp_path / 'images'), tmp_path / 'map')
 
 
 def test_progress_reaches_the_end_of_every_step(room: Room, tmp_path: Path) -> None:
@@ -292,16 +300,18 @@ def test_progress_reaches_the_end_of_every_step(room: Room, tmp_path: Path) -> N
     def remember(step: str, done: int, total: int) -> None:
         last[step] = (done, total)
 
-    options = MapBuildOptions(camera=CAMERA, poses=room.poses, max_keypoints=300)
-    build_map(room.images, tmp_path / 'map', options, remember)
+    images = ImageSet.of_folder(room.images, CAMERA, room.poses)
+    options = MapBuildOptions(max_keypoints=300)
+    build_map(images, tmp_path / 'map', options, remember)
 
     assert list(last) == ['extract', 'match', 'verify', 'sfm', 'save']
     assert all(done == total for done, total in last.values())
 
 
 def test_colmap_keeps_quiet(room: Room, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    options = MapBuildOptions(camera=CAMERA, poses=room.poses, max_keypoints=300)
+    images = ImageSet.of_folder(room.images, CAMERA, room.poses)
+    options = MapBuildOptions(max_keypoints=300)
 
-    build_map(room.images, tmp_path / 'map', options)
+    build_map(images, tmp_path / 'map', options)
 
     assert capfd.readouterr() == ('', '')

@@ -39,7 +39,7 @@ def test_keypoints_without_a_known_ray_have_no_match(tmp_path: Path) -> None:
 
     write_database(
         tmp_path / 'database.db',
-        SfmInput(images, ImageCameras((FISHEYE,), (0, 0)), camera_is_known=True, matches=matches),
+        SfmInput(images, ImageCameras((FISHEYE,), (0, 0)), frozenset({1}), matches),
     )
 
     with pycolmap.Database.open(tmp_path / 'database.db') as database:
