@@ -194,13 +194,13 @@ def _problems(scene_map: SceneMap, views: Sequence[View]) -> dict[str, list[Prob
         features = extractor.extract(view.image)
         found = retrieve(vlad.aggregate(features.descriptors), scene_map, options.retrieved_images)
         scene = next(expanded_scenes(found.images.tolist(), scene_map, options.scene_images))
-        points = scene_map.points[scene.points]
+        points = scene_map.positions_of(scene.points)
         given = MatchInput(
             keypoints=normalise_keypoints(features.keypoints, view.camera),
             focal_length=normalised_focal_length(view.camera),
             descriptors=features.descriptors,
             points=scene_map.camera_from_map[scene.image] * points,
-            point_descriptors=scene_map.descriptors[scene.points],
+            point_descriptors=scene_map.descriptors_of(scene.points),
         )
         for name, matcher in matchers.items():
             problem = _problem(matcher.match(given), features.keypoints, points, view)

@@ -88,7 +88,7 @@ def metre_of(scene_map: SceneMap, *, metric: bool) -> float:
     if metric:
         return 1.0
     distances = [
-        np.linalg.norm(pose * scene_map.points[scene_map.points_seen_by(image)], axis=1)
+        np.linalg.norm(pose * scene_map.positions_of(scene_map.points_seen_by(image)), axis=1)
         for image, pose in enumerate(scene_map.camera_from_map)
     ]
     return METRE_PER_DISTANCE * float(np.median(np.concatenate(distances)))
@@ -204,8 +204,8 @@ def another_building(view: View) -> View:
 
 def with_mixed_up_descriptors(scene_map: SceneMap, rng: np.random.Generator) -> SceneMap:
     """The map with its descriptors handed out to the wrong points; retrieval still works."""
-    order = rng.permutation(len(scene_map.points))
-    return replace(scene_map, descriptors=np.asarray(scene_map.descriptors)[order])
+    order, stored = rng.permutation(scene_map.num_points), scene_map.stored
+    return replace(scene_map, stored=replace(stored, descriptors=stored.descriptors[order]))
 
 
 def _of_nowhere(view: View, image: Image) -> View:

@@ -364,14 +364,12 @@ def covisible_images(
     Returns:
         [I] bool.
     """
-    in_view = _in_view(camera_from_map * scene_map.points, camera)
-    observed = np.diff(scene_map.observation_offsets)
-    image_of = np.repeat(np.arange(scene_map.num_images), observed)
-    candidates = in_view[scene_map.observation_points]
-    points = scene_map.points[scene_map.observation_points[candidates]]
-    image_of = image_of[candidates]
-    centres = np.array([pose.tgt_origin_in_src() for pose in scene_map.camera_from_map])
-    from_reference = points - centres.reshape(-1, 3)[image_of]
+    positions, (_, observations) = scene_map.points, scene_map.observations()
+    observed = scene_map.num_points_seen
+    candidates = _in_view(camera_from_map * positions, camera)[observations]
+    points = positions[observations[candidates]]
+    image_of = np.repeat(np.arange(scene_map.num_images), observed)[candidates]
+    from_reference = points - scene_map.camera_positions[image_of]
     from_camera = points - camera_from_map.tgt_origin_in_src()
     cosines = np.einsum('nk,nk->n', from_reference, from_camera) / (
         np.linalg.norm(from_reference, axis=1) * np.linalg.norm(from_camera, axis=1)

@@ -239,7 +239,7 @@ def query_of(references: ReferenceImages, image: int, keypoints: int | None = No
     """An image, with its best so many keypoints, and what the map is without it."""
     scene_map, described = references.scene_map, references.images[image]
     view = leave_out(references, image)
-    points = scene_map.points[view.points]
+    points = scene_map.positions_of(view.points)
     return Query(
         camera=described.camera,
         camera_from_map=scene_map.camera_from_map[image],

@@ -75,7 +75,8 @@ class Vlad:
         centres, _ = kmeans2(
             descriptors.astype(np.float64), words, iter=_ITERATIONS, minit='++', rng=rng
         )
-        return Vlad(centres.astype(np.float32))
+        # a map keeps them like this, and describes queries with them
+        return Vlad(centres.astype(np.float16).astype(np.float32))
 
     def describe(
         self,

@@ -52,19 +52,24 @@ _MAX_DEPTH_RATIO = 100.0
 _LEAST_DISTANCE = 1e-100
 
 
-def point_covariances(scene_map: SceneMap, points: NDArray[np.int64]) -> NDArray[np.float64]:
+def point_covariances(
+    scene_map: SceneMap, points: NDArray[np.int64], images: NDArray[np.int64]
+) -> NDArray[np.float64]:
     """Errors of triangulated points when each line of sight is off by one radian.
 
     Args:
         scene_map: Tells from which reference images a point was seen.
         points: [K] indices of points.
+        images: [m] reference images, each point seen by one of them at least.
 
     Returns:
         [K,3,3] in the map frame [map units^2 / rad^2]; to be scaled by the true noise.
     """
-    observed = scene_map.observers[points]
+    observers = scene_map.covisible_with(images)
+    observed = scene_map.observers_of(points, observers)
     rows = np.repeat(np.arange(len(points)), np.diff(observed.indptr))
-    sight = scene_map.points[points][rows] - scene_map.camera_positions[observed.indices]
+    positions = scene_map.camera_positions[observers[observed.indices]]
+    sight = scene_map.positions_of(points)[rows] - positions
     distance = np.linalg.norm(sight, axis=1)
     distance = np.maximum(distance, _LEAST_DISTANCE)
     sight /= distance[:, None]

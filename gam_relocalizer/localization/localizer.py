@@ -222,9 +222,8 @@ class Localizer:
         """
         mirrored = np.ascontiguousarray(image[:, ::-1])
         as_mirrored = self._describer.describe(mirrored, self._extractor.extract(mirrored))
-        references = self._scene_map.global_descriptors
         likeness, mirrored_likeness = (
-            float(np.max(references @ each)) for each in (described, as_mirrored)
+            float(np.max(self._scene_map.likeness(each))) for each in (described, as_mirrored)
         )
         return judge_mirrored(likeness, mirrored_likeness)
 
@@ -261,7 +260,7 @@ class Localizer:
         best = max(attempts, key=_rank)
         if not best.accepted or best.estimate is None:
             return best
-        points = self._scene_map.points[best.estimate.inlier_points]
+        points = self._scene_map.positions_of(best.estimate.inlier_points)
         for attempt in attempts:
             if attempt is best or attempt.estimate is None:
                 continue
@@ -297,7 +296,7 @@ class Localizer:
     def _judge(self, estimate: PoseEstimate, scene: Scene, query: _Query) -> Verdict:
         """The cheap checks first; the others only for a pose that would be accepted."""
         camera_from_map, gravity = estimate.camera_from_map, query.prior.gravity
-        points = self._scene_map.points[estimate.inlier_points]
+        points = self._scene_map.positions_of(estimate.inlier_points)
         kept = orientation_kept(camera_from_map, estimate.inlier_points, scene, self._scene_map)
         verdict = judge(estimate, points, kept, self._options.verdict)
         if verdict.status is not Status.ACCEPTED:
@@ -334,8 +333,8 @@ class Localizer:
             keypoints=normalise_keypoints(query.features.keypoints, query.camera),
             focal_length=normalised_focal_length(query.camera),
             descriptors=query.features.descriptors,
-            points=reference_from_map * self._scene_map.points[scene.points],
-            point_descriptors=self._scene_map.descriptors[scene.points],
+            points=reference_from_map * self._scene_map.positions_of(scene.points),
+            point_descriptors=self._scene_map.descriptors_of(scene.points),
         )
         return self._matcher.match(given)
 
@@ -346,12 +345,12 @@ class Localizer:
         points = scene.points[matches.point_indices]
         pose = estimate_pose(
             keypoints,
-            self._scene_map.points[points],
+            self._scene_map.positions_of(points),
             matches.weights,
             camera,
             self._options.pose,
             matches.nearest,
-            point_covariances(self._scene_map, points),
+            point_covariances(self._scene_map, points, scene.images),
         )
         if pose is None:
             return None
@@ -464,8 +463,12 @@ def _check_identity(
             f'extractors cannot be compared: build the map again with this one'
         )
         raise MapError(msg)
-    manifest, length = scene_map.manifest, scene_map.global_descriptors.shape[1]
-    described_by = manifest.retrieval, manifest.retrieval_weights_sha256, length
+    manifest = scene_map.manifest
+    described_by = (
+        manifest.retrieval,
+        manifest.retrieval_weights_sha256,
+        manifest.global_dimension,
+    )
     here = describer.name, describer.weights_sha256, describer.dimension
     if described_by != here:
         msg = (

@@ -74,10 +74,10 @@ def look_alike_of(
         np.linspace(0, len(inliers) - 1, min(len(inliers), _MAX_KEYPOINTS)).astype(int)
     ]
     alike = knn_ratio(
-        features.descriptors[chosen], scene_map.descriptors[points], _NEIGHBOURS, _RATIO
+        features.descriptors[chosen], scene_map.descriptors_of(points), _NEIGHBOURS, _RATIO
     )
     keypoints = features.keypoints[chosen[alike.edges[:, 0]]].astype(np.float64)
-    places = scene_map.points[points[alike.edges[:, 1]]]
+    places = scene_map.positions_of(points[alike.edges[:, 1]])
     errors = reprojection_errors(camera_from_map, keypoints, places, camera)
     elsewhere = errors > _APART * options.threshold_px(camera)
     if np.count_nonzero(elsewhere) < MIN_MATCHES:

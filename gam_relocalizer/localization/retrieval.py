@@ -52,7 +52,7 @@ def retrieve(
     """
     if not scene_map.num_images or not np.any(global_descriptor):
         return Retrieved(np.empty(0, np.int64), np.empty(0, np.float32))
-    scores = np.asarray(scene_map.global_descriptors @ global_descriptor, np.float32)
+    scores = scene_map.likeness(global_descriptor)
     images = np.argsort(-scores, kind='stable')
     if among is not None:
         images = images[among[images]]

@@ -143,8 +143,8 @@ def orientation_kept(
     """
     seen = [np.isin(points, scene_map.points_seen_by(image)).sum() for image in scene.images]
     reference_from_map = scene_map.camera_from_map[scene.images[int(np.argmax(seen))]]
-    in_reference = reference_from_map * scene_map.points[points]
-    in_query = camera_from_map * scene_map.points[points]
+    positions = scene_map.positions_of(points)
+    in_reference, in_query = reference_from_map * positions, camera_from_map * positions
     in_front = (in_reference[:, 2] > 0) & (in_query[:, 2] > 0)
     on_reference = in_reference[in_front, :2] / in_reference[in_front, 2:]
     on_query = in_query[in_front, :2] / in_query[in_front, 2:]

@@ -55,7 +55,8 @@ def support_of(
         scene_map: The map.
     """
     points = _expected_points(camera_from_map, inlier_points, scene, scene_map)
-    in_camera = np.asarray(camera_from_map * scene_map.points[points], np.float64).reshape(-1, 3)
+    in_map = scene_map.positions_of(points)
+    in_camera = np.asarray(camera_from_map * in_map, np.float64).reshape(-1, 3)
     pixels = _seen_at(in_camera[in_camera[:, 2] > 0], camera)
     if not len(pixels):
         return Support(in_view=0, unmatched=1.0)
@@ -70,15 +71,17 @@ def _expected_points(
     scene_map: SceneMap,
 ) -> NDArray[np.int64]:
     """Points that witnesses saw from about where the camera is."""
-    shared = np.asarray(scene_map.observers[inlier_points][:, scene.images].sum(axis=0)).ravel()
+    observers = scene_map.observers_of(inlier_points, scene.images)
+    shared = np.asarray(observers.sum(axis=0)).ravel()
     most = np.argsort(-shared, kind='stable')[:_WITNESSES]
     witnesses = scene.images[most[shared[most] >= _WITNESS_SHARE * shared.max()]]
     camera_in_map = camera_from_map.tgt_origin_in_src()
     expected = []
     for witness in witnesses:
         seen = scene_map.points_seen_by(int(witness)).astype(np.int64)
-        from_camera = scene_map.points[seen] - camera_in_map
-        from_witness = scene_map.points[seen] - scene_map.camera_positions[witness]
+        positions = scene_map.positions_of(seen)
+        from_camera = positions - camera_in_map
+        from_witness = positions - scene_map.camera_positions[witness]
         far, near = (np.linalg.norm(each, axis=1) for each in (from_camera, from_witness))
         cosine = np.einsum('ki,ki->k', from_camera, from_witness) / np.maximum(far * near, 1e-300)
         alike = cosine > np.cos(np.radians(_MAX_TURN_DEG))

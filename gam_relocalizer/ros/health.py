@@ -283,7 +283,7 @@ class Health:
             str(scene_map.path),
             manifest.map_id,
             scene_map.num_images,
-            len(scene_map.points),
+            scene_map.num_points,
             manifest.frame.metric,
         )
         self.device = device

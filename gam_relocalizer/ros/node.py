@@ -29,7 +29,7 @@ from gam_relocalizer.ros.diagnostics import Diagnostics
 from gam_relocalizer.ros.health import Health, State
 from gam_relocalizer.ros.map_loader import MapLoader
 from gam_relocalizer.ros.memory import give_back_freed_memory
-from gam_relocalizer.ros.outputs import Outputs
+from gam_relocalizer.ros.outputs import MAP_POINTS_SHOWN, Outputs
 from gam_relocalizer.ros.parameters import declare_parameters, fixed_changes, known_among
 from gam_relocalizer.ros.requests import Answer, answered
 from gam_relocalizer.ros.services import Services
@@ -280,7 +280,7 @@ class RelocalizerNode(LifecycleNode):
         manifest = scene_map.manifest
         return (
             f'map {scene_map.path} ({manifest.map_id}): {scene_map.num_images} images, '
-            f'{len(scene_map.points)} points; extractor {manifest.extractor.name}, matcher '
+            f'{scene_map.num_points} points; extractor {manifest.extractor.name}, matcher '
             f'{self._settings.matcher}; networks on the CPU with {torch.get_num_threads()} threads'
         )
 
@@ -300,7 +300,7 @@ class RelocalizerNode(LifecycleNode):
 
     def _show_map(self, scene_map: SceneMap) -> None:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._settings.map_frame)
-        self._outputs.publish_map_points(header, scene_map.points)
+        self._outputs.publish_map_points(header, scene_map.some_points(MAP_POINTS_SHOWN))
 
     def _end_session(self) -> None:
         if self._session is not None:

@@ -46,6 +46,8 @@ LATCHED_QOS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 PATH_LENGTH = 1000
+# 1.2 MB: the message is kept for late subscribers, and sent to each of them at once.
+MAP_POINTS_SHOWN = 100_000
 
 
 class Outputs:
@@ -87,7 +89,7 @@ class Outputs:
         self._status.publish(status_message(result, header, map_id))
 
     def publish_map_points(self, header: Header, points: NDArray[np.float64]) -> None:
-        """The points [N,3] of the map; late subscribers get them as well."""
+        """Points [N,3] of the map; late subscribers get them as well."""
         self._map_points.publish(point_cloud_message(points, header))
 
     @property

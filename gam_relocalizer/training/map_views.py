@@ -99,9 +99,9 @@ def map_view(
     if len(kept_keypoints) < FEWEST_KEYPOINTS or len(kept_points) < FEWEST_POINTS:
         return None
     reference_from_map = scene_map.camera_from_map[covisible[0]]
-    row_of_point = np.full(len(scene_map.points) + 1, NO_POINT)
+    row_of_point = np.full(scene_map.num_points + 1, NO_POINT)
     row_of_point[part.points[kept_points]] = np.arange(len(kept_points))
-    positions = scene_map.points[part.points[kept_points]]
+    positions = scene_map.positions_of(part.points[kept_points])
     in_reference = reference_from_map * positions
     image_from_image = _roll(rng)
     normalised = normalise_keypoints(query.keypoints[kept_keypoints], query.camera)

@@ -31,7 +31,7 @@ from gam_relocalizer.evaluation.matching import TRUE_CANDIDATES
 from gam_relocalizer.geometry import write_poses
 from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.mapping.build import MapBuildOptions, build_map
-from gam_relocalizer.scene_map import SFM, MapContent, load_map, save_map
+from gam_relocalizer.scene_map import SFM, load_content, load_map, save_map
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -334,18 +334,5 @@ def test_localization_refuses_what_does_not_fit_together(
 
 
 def _save_without_model(path: Path, bare: Path) -> None:
-    scene_map = load_map(path)
-    sfm_from_map = scene_map.manifest.frame.map_from_sfm.inverse()
-    content = MapContent(
-        image_names=scene_map.image_names,
-        camera_from_sfm=tuple(
-            sfm_from_map.transform_camera_world(pose) for pose in scene_map.camera_from_map
-        ),
-        points=sfm_from_map * scene_map.points,
-        descriptors=scene_map.descriptors,
-        observation_offsets=scene_map.observation_offsets,
-        observation_points=scene_map.observation_points,
-        global_descriptors=scene_map.global_descriptors,
-        codebook=scene_map.codebook,
-    )
-    save_map(bare, content, scene_map.manifest, None)
+    manifest, content = load_content(path)
+    save_map(bare, content, manifest, None)

@@ -72,7 +72,7 @@ def test_points_lie_on_the_surfaces_that_their_images_see(
 
 def test_every_point_is_seen_by_two_images_or_more(scene_map: SceneMap) -> None:
     assert len(scene_map.points) > 300
-    seen = np.bincount(scene_map.observation_points, minlength=len(scene_map.points))
+    seen = np.bincount(scene_map.observations()[1], minlength=scene_map.num_points)
     assert seen.min() >= 2
 
 

@@ -13,6 +13,7 @@ import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from map_content import changed_map
 
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.evaluation.matching import (
@@ -37,7 +38,13 @@ from gam_relocalizer.mapping.leave_one_out import (
 )
 from gam_relocalizer.matching.baselines import NearestNeighbourCross
 from gam_relocalizer.matching.matcher import Matches, MatchInput
-from gam_relocalizer.scene_map import ExtractorIdentity, Manifest, MapFrame, SceneMap
+from gam_relocalizer.scene_map import (
+    ExtractorIdentity,
+    Manifest,
+    MapContent,
+    MapFrame,
+    map_in_memory,
+)
 
 CAMERA = pycolmap.Camera(
     camera_id=1, model='PINHOLE', width=640, height=480, params=[500.0, 500.0, 320.0, 240.0]
@@ -274,17 +281,19 @@ def walk_past_points(alone: int = 0) -> ReferenceImages:
         keypoints = np.asarray(CAMERA.img_from_cam(pose * points[observed]), np.float32)
         images.append(ReferenceImage(CAMERA, keypoints, looks[observed], observed))
     seen = [np.flatnonzero(row) for row in sees]
-    scene_map = SceneMap(
-        path=Path('somewhere/walk'),
-        manifest=Manifest(ExtractorIdentity('exact', 60, ''), 'vlad', MapFrame(metric=True), {}),
-        image_names=tuple(map(str, range(num_images))),
-        camera_from_map=poses,
-        points=points,
-        descriptors=looks.astype(np.float16),
-        observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
-        observation_points=np.concatenate(seen).astype(np.int32),
-        global_descriptors=rng.normal(size=(num_images, 8)).astype(np.float32),
-        codebook=np.zeros((1, 60), np.float32),
+    scene_map = map_in_memory(
+        Path('somewhere/walk'),
+        MapContent(
+            image_names=tuple(map(str, range(num_images))),
+            camera_from_sfm=poses,
+            points=points,
+            descriptors=looks.astype(np.float16),
+            observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
+            observation_points=np.concatenate(seen).astype(np.int32),
+            global_descriptors=rng.normal(size=(num_images, 8)).astype(np.float32),
+            codebook=np.zeros((1, 60), np.float32),
+        ),
+        Manifest(ExtractorIdentity('exact', 60, ''), 'vlad', MapFrame(metric=True), {}),
     )
     sums = sees.sum(axis=0)[:, None] * looks
     return ReferenceImages(scene_map, tuple(images), sums.astype(np.float32))
@@ -327,10 +336,13 @@ def test_images_without_truth_are_counted_and_left_out() -> None:
 
 def test_a_map_whose_images_share_nothing_cannot_be_evaluated() -> None:
     references = walk_past_points(alone=2)
-    alone = replace(
+    alone = changed_map(
         references.scene_map,
-        observation_offsets=np.array([0, 0, 0, 0, 0, 1, 2]),
-        observation_points=np.array([50, 51], np.int32),
+        lambda content: replace(
+            content,
+            observation_offsets=np.array([0, 0, 0, 0, 0, 1, 2]),
+            observation_points=np.array([50, 51], np.int32),
+        ),
     )
     with pytest.raises(MapError, match='walk'):
         evaluate_map(replace(references, scene_map=alone), {'cross': NearestNeighbourCross()})

@@ -25,6 +25,7 @@ from gam_relocalizer.scene_map import (
     MapFrame,
     SceneMap,
     load_map,
+    map_in_memory,
     save_map,
 )
 
@@ -149,17 +150,19 @@ def bare_map(
     points: np.ndarray, poses: Sequence[pycolmap.Rigid3d], seen: Sequence[np.ndarray]
 ) -> SceneMap:
     """A map of points, and of which of them each camera sees; nothing looks like anything."""
-    return SceneMap(
-        path=Path('nowhere'),
-        manifest=Manifest(IDENTITY, RETRIEVAL_NAME, MapFrame(), {}),
-        image_names=tuple(f'{index:03}.png' for index in range(len(poses))),
-        camera_from_map=tuple(poses),
-        points=points,
-        descriptors=np.zeros((len(points), 64), np.float16),
-        observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
-        observation_points=np.concatenate(seen).astype(np.int32),
-        global_descriptors=np.zeros((len(poses), 16), np.float32),
-        codebook=np.zeros((0, 64), np.float32),
+    return map_in_memory(
+        Path('nowhere'),
+        MapContent(
+            image_names=tuple(f'{index:03}.png' for index in range(len(poses))),
+            camera_from_sfm=tuple(poses),
+            points=points,
+            descriptors=np.zeros((len(points), 64), np.float16),
+            observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
+            observation_points=np.concatenate(seen).astype(np.int32),
+            global_descriptors=np.zeros((len(poses), 16), np.float32),
+            codebook=np.zeros((0, 64), np.float32),
+        ),
+        Manifest(IDENTITY, RETRIEVAL_NAME, MapFrame(), {}),
     )
 
 

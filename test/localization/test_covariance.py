@@ -53,7 +53,8 @@ def covariances_seen_from(points: np.ndarray, positions: np.ndarray) -> np.ndarr
     """Of points [K,3] that cameras at all positions [I,3] see."""
     poses = [rigid3d_from([1, 0, 0, 0], -position) for position in positions]
     everything = np.arange(len(points))
-    return point_covariances(bare_map(points, poses, [everything] * len(poses)), everything)
+    scene_map = bare_map(points, poses, [everything] * len(poses))
+    return point_covariances(scene_map, everything, np.arange(len(poses)))
 
 
 def triangulated(point: np.ndarray, positions: np.ndarray, sigma: float, draws: int) -> np.ndarray:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ import pycolmap
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from map_content import changed_map, of_first_images
 from synthetic_place import (
     CAMERA,
     IDENTITY,
@@ -43,7 +45,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from gam_relocalizer.features.local import LocalFeatures
-    from gam_relocalizer.scene_map import SceneMap
+    from gam_relocalizer.scene_map import MapContent, SceneMap
 
 PLACE = Place()
 FISHEYE = pycolmap.Camera(
@@ -99,8 +101,12 @@ def localize_near(
 
 def with_retrieval_turned_round(scene_map: SceneMap) -> SceneMap:
     """Every image of the ring is retrieved by what the opposite one looks like."""
-    turned = np.roll(scene_map.global_descriptors, NUM_IMAGES // 2, axis=0)
-    return replace(scene_map, global_descriptors=turned)
+
+    def turn(content: MapContent) -> MapContent:
+        turned = np.roll(content.global_descriptors, NUM_IMAGES // 2, axis=0)
+        return replace(content, global_descriptors=turned)
+
+    return changed_map(scene_map, turn)
 
 
 def check_invariants(result: LocalizationResult) -> None:
@@ -200,14 +206,7 @@ def test_image_of_another_size_than_the_camera_is_refused(scene_map: SceneMap) -
 
 
 def test_empty_map_gives_no_scene(scene_map: SceneMap) -> None:
-    empty = replace(
-        scene_map,
-        image_names=(),
-        camera_from_map=(),
-        observation_offsets=np.zeros(1, np.int64),
-        observation_points=np.zeros(0, np.int32),
-        global_descriptors=scene_map.global_descriptors[:0],
-    )
+    empty = changed_map(scene_map, partial(of_first_images, count=0))
     result = localize(empty, features_of(PLACE, query_pose(0), seed=0))
     assert result.status is Status.NO_SCENE
     assert result.scenes_tried == 0

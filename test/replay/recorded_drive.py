@@ -21,7 +21,14 @@ from gam_relocalizer.localization.result import (
     Support,
     Timings,
 )
-from gam_relocalizer.scene_map import ExtractorIdentity, Manifest, MapFrame, SceneMap
+from gam_relocalizer.scene_map import (
+    ExtractorIdentity,
+    Manifest,
+    MapContent,
+    MapFrame,
+    SceneMap,
+    map_in_memory,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -121,22 +128,24 @@ def wall_map_at(path: Path) -> SceneMap:
         [5.0 * np.cos(around), 5.0 * np.sin(around), random.uniform(0.0, 2.5, len(around))]
     )
     references = range(0, 100, 20)
-    return SceneMap(
-        path=path,
-        manifest=Manifest(
+    return map_in_memory(
+        path,
+        MapContent(
+            image_names=tuple(f'{index}.jpg' for index in references),
+            camera_from_sfm=tuple(camera_from_map_at(index) for index in references),
+            points=points,
+            descriptors=np.zeros((len(points), 4), dtype=np.float16),
+            observation_offsets=np.zeros(len(references) + 1, dtype=np.int64),
+            observation_points=np.zeros(0, dtype=np.int32),
+            global_descriptors=np.zeros((len(references), 4), dtype=np.float32),
+            codebook=np.zeros((1, 4), dtype=np.float32),
+        ),
+        Manifest(
             extractor=ExtractorIdentity('none', 4, ''),
             retrieval='none',
             frame=MapFrame(metric=True),
             counts={'images': len(references), 'points': len(points), 'observations': 0},
         ),
-        image_names=tuple(f'{index}.jpg' for index in references),
-        camera_from_map=tuple(camera_from_map_at(index) for index in references),
-        points=points,
-        descriptors=np.zeros((len(points), 4), dtype=np.float16),
-        observation_offsets=np.zeros(len(references) + 1, dtype=np.int64),
-        observation_points=np.zeros(0, dtype=np.int32),
-        global_descriptors=np.zeros((len(references), 4), dtype=np.float32),
-        codebook=np.zeros((1, 4), dtype=np.float32),
     )
 
 

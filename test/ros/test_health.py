@@ -16,7 +16,14 @@ from hypothesis import strategies as st
 from gam_relocalizer.localization.result import LocalizationResult, Status, Timings
 from gam_relocalizer.ros.conditions import Condition, Diagnosis, Level, diagnose
 from gam_relocalizer.ros.health import RECENT, SECOND, Health, State
-from gam_relocalizer.scene_map import ExtractorIdentity, Manifest, MapFrame, SceneMap
+from gam_relocalizer.scene_map import (
+    ExtractorIdentity,
+    Manifest,
+    MapContent,
+    MapFrame,
+    SceneMap,
+    map_in_memory,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,19 +41,17 @@ def scene_map(*, metric: bool = True) -> SceneMap:
     manifest = Manifest(
         ExtractorIdentity('xfeat', 64, ''), 'vlad', MapFrame(metric=metric), {'images': 2}
     )
-    nothing = np.zeros((0, 3))
-    return SceneMap(
-        Path('/maps/hall'),
-        manifest,
-        ('a.png', 'b.png'),
-        (),
-        np.zeros((7, 3)),
-        nothing.astype(np.float16),
-        np.zeros(3, np.int64),
-        np.zeros(0, np.int32),
-        nothing.astype(np.float32),
-        nothing.astype(np.float32),
+    content = MapContent(
+        image_names=('a.png', 'b.png'),
+        camera_from_sfm=(),
+        points=np.zeros((7, 3)),
+        descriptors=np.zeros((7, 64)),
+        observation_offsets=np.zeros(3, np.int64),
+        observation_points=np.zeros(0, np.int32),
+        global_descriptors=np.zeros((2, 3), np.float32),
+        codebook=np.zeros((1, 3), np.float32),
     )
+    return map_in_memory(Path('/maps/hall'), content, manifest)
 
 
 class Simulated:

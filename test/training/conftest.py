@@ -10,7 +10,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gam_relocalizer.mapping.leave_one_out import NO_POINT, ReferenceImage, ReferenceImages
-from gam_relocalizer.scene_map import ExtractorIdentity, FileEntry, Manifest, MapFrame, SceneMap
+from gam_relocalizer.scene_map import (
+    ExtractorIdentity,
+    FileEntry,
+    Manifest,
+    MapContent,
+    MapFrame,
+    map_in_memory,
+)
 
 DIMENSION = 16
 CLUTTER = 60
@@ -37,23 +44,25 @@ def make_references(
     for image in described:
         observes = image.point_of_keypoint != NO_POINT
         sums[image.point_of_keypoint[observes]] += image.descriptors[observes]
-    scene_map = SceneMap(
-        path=Path(name),
-        manifest=Manifest(
+    scene_map = map_in_memory(
+        Path(name),
+        MapContent(
+            image_names=tuple(map(str, range(images))),
+            camera_from_sfm=tuple(poses),
+            points=positions,
+            descriptors=_unit(sums).astype(np.float16),
+            observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
+            observation_points=np.concatenate(seen).astype(np.int32),
+            global_descriptors=_unit(rng.normal(size=(images, 8))),
+            codebook=np.zeros((1, DIMENSION), np.float32),
+        ),
+        Manifest(
             ExtractorIdentity('synthetic', DIMENSION, ''),
             'vlad',
             MapFrame(),
             {},
             files={'points.npy': FileEntry(1, f'{name} {seed}')},
         ),
-        image_names=tuple(map(str, range(images))),
-        camera_from_map=tuple(poses),
-        points=positions,
-        descriptors=_unit(sums).astype(np.float16),
-        observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
-        observation_points=np.concatenate(seen).astype(np.int32),
-        global_descriptors=_unit(rng.normal(size=(images, 8))),
-        codebook=np.zeros((1, DIMENSION), np.float32),
     )
     return ReferenceImages(scene_map, tuple(described), sums)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ import pycolmap
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from map_content import changed_map, of_first_images, with_points
 
 from gam_relocalizer.cameras import have_known_rays
 from gam_relocalizer.mapping.leave_one_out import NO_POINT
@@ -101,7 +103,7 @@ def test_an_edge_of_a_track_is_true_however_badly_its_point_was_triangulated(
     references: ReferenceImages,
 ) -> None:
     scene_map = references.scene_map
-    aside = replace(scene_map, points=scene_map.points + np.array([1.0, 0.0, 0.0]))
+    aside = with_points(scene_map, scene_map.points + np.array([1.0, 0.0, 0.0]))
 
     view = drawn(replace(references, scene_map=aside), 0, 0)
 
@@ -168,15 +170,7 @@ def test_descriptors_of_points_are_the_means_over_the_chosen_images(
 ) -> None:
     few = replace(
         references,
-        scene_map=replace(
-            references.scene_map,
-            image_names=('0', '1', '2'),
-            camera_from_map=references.scene_map.camera_from_map[:3],
-            observation_offsets=references.scene_map.observation_offsets[:4],
-            observation_points=references.scene_map.observation_points[
-                : references.scene_map.observation_offsets[3]
-            ],
-        ),
+        scene_map=changed_map(references.scene_map, partial(of_first_images, count=3)),
         images=references.images[:3],
     )
     found = {'both': 0, 'one': 0}
@@ -275,7 +269,7 @@ def test_points_behind_the_camera_project_nowhere(references: ReferenceImages) -
     behind = scene_map.camera_from_map[0].inverse() * np.array([[0.0, 0.0, -5.0]])
     positions = scene_map.points.copy()
     positions[::2] = behind
-    view = drawn(replace(references, scene_map=replace(scene_map, points=positions)), 0, 0)
+    view = drawn(replace(references, scene_map=with_points(scene_map, positions)), 0, 0)
 
     hidden = np.isnan(view.projections).any(axis=1)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from map_content import changed_map
 
 from gam_relocalizer.errors import TrainingError
 from gam_relocalizer.training.batches import STRIDE, GraphBatch
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from gam_relocalizer.mapping.leave_one_out import ReferenceImages
+    from gam_relocalizer.scene_map import MapContent
     from gam_relocalizer.training.labelled import LabelledGraph
 
 SIZE = (64, 128), (200, 400)
@@ -146,11 +148,15 @@ def test_says_what_becomes_of_the_images(
 
 
 def test_images_that_share_nothing_are_no_queries(references: ReferenceImages) -> None:
-    scene_map = references.scene_map
-    offsets = scene_map.observation_offsets.copy()
-    of_others = scene_map.observation_points[offsets[1] :]
-    offsets[1:] -= offsets[1]
-    alone = replace(scene_map, observation_offsets=offsets, observation_points=of_others)
+    def without_first(content: MapContent) -> MapContent:
+        offsets = content.observation_offsets
+        return replace(
+            content,
+            observation_offsets=np.maximum(offsets - offsets[1], 0),
+            observation_points=content.observation_points[offsets[1] :],
+        )
+
+    alone = changed_map(references.scene_map, without_first)
 
     (use,) = source([replace(references, scene_map=alone)]).map_uses
 
