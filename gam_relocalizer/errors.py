@@ -33,6 +33,14 @@ class MapBuildError(RelocalizerError):
     """A map cannot be built from the given images."""
 
 
+class AlignmentError(RelocalizerError):
+    """A map cannot be laid into the wanted frame by what is given."""
+
+
+class VideoError(RelocalizerError):
+    """A video cannot be read."""
+
+
 class BagError(RelocalizerError):
     """A bag cannot be read, or lacks what a replay needs."""
 
@@ -51,3 +59,15 @@ class WeightsError(RelocalizerError):
 
 class TrainingError(RelocalizerError):
     """A training run cannot start or continue."""
+
+
+class DatasetError(RelocalizerError):
+    """A dataset's folder lacks files, or they are malformed."""
+
+
+class ModelError(RelocalizerError):
+    """A COLMAP model, or the features that go with it, are missing, damaged or do not fit."""
+
+
+class ViewerError(RelocalizerError):
+    """The 3D viewer did not start, or failed."""

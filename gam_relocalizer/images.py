@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 IMAGE_SUFFIXES = frozenset({'.jpg', '.jpeg', '.png', '.bmp', '.tif', '.tiff', '.webp', '.ppm'})
 MIN_BAYER_SIDE = 3
+# More than the largest image takes without any compression, with 16 bits in four channels.
+MAX_IMAGE_BYTES = 8 * MAX_IMAGE_PIXELS
 
 
 @dataclass(frozen=True)
@@ -125,12 +127,24 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         ImageError: The file is missing, is no image, or is larger than `MAX_IMAGE_PIXELS`.
     """
+    return decode_compressed(read_encoded(path), str(path))
+
+
+def read_encoded(path: Path) -> NDArray[np.uint8]:
+    """Reads the bytes of an image file, for `decode_compressed`.
+
+    Raises:
+        ImageError: The file is missing, or larger than any image may be.
+    """
     try:
-        encoded = np.fromfile(path, dtype=np.uint8)
+        size = path.stat().st_size
+        if size > MAX_IMAGE_BYTES:
+            msg = f'{path}: {size} bytes are more than {MAX_IMAGE_BYTES}; this is no image'
+            raise ImageError(msg)
+        return np.fromfile(path, dtype=np.uint8)
     except OSError as err:
         msg = f'{path}: cannot be read: {err.strerror}'
         raise ImageError(msg) from err
-    return decode_compressed(encoded, str(path))
 
 
 def decode_compressed(encoded: NDArray[np.uint8], source: str) -> NDArray[np.uint8]:

@@ -5,9 +5,8 @@
 from __future__ import annotations
 
 import os
-import tempfile
+from contextlib import nullcontext
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,43 +24,39 @@ from gam_relocalizer.features.registry import (
 )
 from gam_relocalizer.features.vlad import Vlad
 from gam_relocalizer.mapping.descriptors import describe_points
-from gam_relocalizer.mapping.extraction import extract_images
+from gam_relocalizer.mapping.extraction import Extraction
 from gam_relocalizer.mapping.intrinsics import assign_cameras
-from gam_relocalizer.mapping.matching import mutual_nearest_neighbours
 from gam_relocalizer.mapping.pairs import choose_pairs
-from gam_relocalizer.mapping.progress import StepTimer, ignore_progress
+from gam_relocalizer.mapping.progress import ignore_progress
 from gam_relocalizer.mapping.report import BuildReport
-from gam_relocalizer.mapping.sfm import (
-    MIN_IMAGES,
-    SfmInput,
-    image_id_of,
-    map_images,
-    quiet_colmap,
-    triangulate,
-    verify_geometry,
-    write_database,
+from gam_relocalizer.mapping.sfm import MIN_IMAGES, SfmInput, image_id_of, quiet_colmap
+from gam_relocalizer.mapping.steps import Matched, Steps
+from gam_relocalizer.mapping.workspace import temporary_workspace
+from gam_relocalizer.scene_map import (
+    DESCRIPTOR_BITS,
+    MANIFEST,
+    Manifest,
+    MapContent,
+    MapFrame,
+    save_map,
 )
-from gam_relocalizer.scene_map import MANIFEST, Manifest, MapContent, MapFrame, save_map
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
+    from pathlib import Path
 
     from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor
     from gam_relocalizer.image_set import ImageSet
-    from gam_relocalizer.mapping.extraction import ExtractedImages, MappingImage
+    from gam_relocalizer.mapping.extraction import ExtractionResult, StoredImages
     from gam_relocalizer.mapping.progress import Progress
+    from gam_relocalizer.mapping.steps import Model, Retrieval
+    from gam_relocalizer.mapping.workspace import Workspace
 
 MAPPERS = ('incremental', 'global')
-# Least cosine of two descriptors that may be the same point.
-_MIN_SIMILARITY = {'xfeat': 0.82, 'sift': 0.80}
-# Repeated windows and tiles lead whole images astray; a mild test costs one true match in six.
-_MAX_RATIO = 0.95
 _EXAMPLES = 3
-# Wrong poses triangulate accidental pairs of rays; what exists is seen from three sides and more.
-_MIN_MEAN_TRACK_LENGTH = 2.3
+# Poses within some hundred metres of their origin keep it: single precision holds 0.03 mm there.
+_ROUND_PLACE = 1000.0
 
 
 @dataclass(frozen=True)
@@ -75,6 +70,7 @@ class MapBuildOptions:
         mapper: `incremental` or `global` structure from motion; unused with poses.
         global_descriptor: Name of what images are retrieved by.
         global_weights: Weights file of the global descriptor, when it needs one.
+        descriptor_bits: That the map keeps of each number of a local descriptor: 16 or 8.
     """
 
     refine_camera: bool = False
@@ -83,25 +79,7 @@ class MapBuildOptions:
     mapper: str = 'incremental'
     global_descriptor: str = DEFAULT_GLOBAL_DESCRIPTOR
     global_weights: Path | None = None
-
-
-@dataclass(frozen=True)
-class _Model:
-    """The outcome of structure from motion."""
-
-    reconstruction: pycolmap.Reconstruction
-    other_models: tuple[int, ...]
-    pairs_matched: int
-    pairs_verified: int
-
-
-@dataclass(frozen=True)
-class _Retrieval:
-    """Global descriptors of the images, and what made them; a codebook if it was learned here."""
-
-    describer: GlobalDescriptor
-    global_descriptors: NDArray[np.float32]
-    codebook: NDArray[np.float32]
+    descriptor_bits: int = 16
 
 
 def build_map(
@@ -109,54 +87,79 @@ def build_map(
     out: Path,
     options: MapBuildOptions | None = None,
     progress: Progress = ignore_progress,
+    workspace: Workspace | None = None,
 ) -> BuildReport:
     """Builds a map bundle; the same images and options give the same map.
+
+    The folder of images is only read.
 
     Args:
         images: What is to be mapped; with poses the map lies in their frame and scale.
         out: The bundle; an existing bundle is replaced once the new one is complete.
         options: See there.
         progress: Told of the steps extract, match, verify, sfm and save.
+        workspace: Where steps find their results of an earlier build, and leave them for a later
+            one; without one nothing is left behind. It changes nothing about the map.
 
     Raises:
         UsageError: Unknown extractor, global descriptor or mapper, weights missing or not needed,
-            or a camera that does not fit.
+            an impossible number of bits, or a camera that does not fit.
         WeightsError: Weights of the local or global descriptor are missing or damaged.
         PosesFileError: The poses name none of the images.
         MapError: `out` exists and is not a map bundle, or cannot be written.
-        MapBuildError: The images do not make a map; the message says why and what to do.
+        MapBuildError: The images do not make a map, or the workspace cannot be written to; the
+            message says why and what to do.
     """
     options = options or MapBuildOptions()
-    _check_output(out)
-    if options.mapper not in MAPPERS:
-        msg = f'unknown mapper `{options.mapper}`; known are {", ".join(MAPPERS)}'
-        raise UsageError(msg)
+    check_output(out)
+    _check_options(options)
     extractor = create_extractor(options.extractor, options.max_keypoints)
     describer = load_global_descriptor(options.global_descriptor, options.global_weights)
-    _check_names(images.names)
+    check_names(images.names)
     wanted = _with_pose(images.names, images.camera_from_world)
-    timer = StepTimer()
-    with timer.step('extract'):
-        extracted = extract_images(images.folder, wanted, extractor, describer, progress)
-    _check_usable(extracted, images.folder)
-    cameras = assign_cameras(images, extracted.images)
-    with timer.step('match'):
-        retrieval = _describe_images(extracted.images, describer)
-        matches = _match(extracted.images, retrieval, options, progress)
-    constant = frozenset() if options.refine_camera else cameras.given
-    sfm_input = SfmInput(extracted.images, cameras, constant, matches, images.camera_from_world)
-    model = _reconstruct(sfm_input, options.mapper, timer, progress)
-    with timer.step('describe'):
-        content = _content(model.reconstruction, extracted.images, retrieval)
-    report = _report(images.names, wanted, extracted, model, content, timer)
-    progress('save', 0, 1)
-    manifest = _manifest(images, extractor, retrieval.describer, options, report)
-    save_map(out, content, manifest, model.reconstruction)
+    where = nullcontext(workspace) if workspace is not None else temporary_workspace()
+    with where as used, quiet_colmap():
+        steps = Steps(used, progress)
+        extraction = Extraction(extractor, options.max_keypoints, describer)
+        extracted = steps.extract(images.folder, wanted, extraction)
+        _check_usable(extracted, images.folder)
+        cameras = assign_cameras(images, extracted.images)
+        retrieval = steps.describe(extracted.images, learn_words=describer is None)
+        matched = Matched(
+            extracted.images, choose_pairs(retrieval.global_descriptors), options.extractor
+        )
+        frame = _frame(images, wanted)
+        sfm_input = SfmInput(
+            images=extracted.images,
+            cameras=cameras,
+            constant_cameras=frozenset() if options.refine_camera else cameras.given,
+            matches={},
+            camera_from_sfm=_camera_from_sfm(images, frame),
+        )
+        model = steps.reconstruct(matched, sfm_input, options.mapper)
+        with steps.timer.step('describe'):
+            content = _content(model.reconstruction, extracted.images, retrieval)
+        report = _report(images.names, wanted, extracted, matched, model, content, steps)
+        progress('save', 0, 1)
+        identity = describer or Vlad(retrieval.codebook)
+        manifest = _manifest(images, frame, extractor, identity, options, report)
+        _save(out, content, manifest, model.reconstruction)
+        steps.forget_others()
     progress('save', 1, 1)
     return report
 
 
-def _check_output(out: Path) -> None:
+def _check_options(options: MapBuildOptions) -> None:
+    if options.mapper not in MAPPERS:
+        msg = f'unknown mapper `{options.mapper}`; known are {", ".join(MAPPERS)}'
+        raise UsageError(msg)
+    if options.descriptor_bits not in DESCRIPTOR_BITS:
+        known = ' or '.join(map(str, DESCRIPTOR_BITS))
+        msg = f'descriptors of {options.descriptor_bits} bits: must be {known}'
+        raise UsageError(msg)
+
+
+def check_output(out: Path) -> None:
     """Finds out before an hour of work, and not after it, that the result has no place."""
     if out.exists() and not (out / MANIFEST).is_file():
         msg = f'{out}: exists and is not a map bundle (no {MANIFEST}); choose another name'
@@ -167,7 +170,7 @@ def _check_output(out: Path) -> None:
         raise MapError(msg)
 
 
-def _check_names(names: Sequence[str]) -> None:
+def check_names(names: Sequence[str]) -> None:
     """Refuses names that a line of a poses file cannot hold."""
     for name in names:
         encodable = name.encode('utf-8', errors='ignore').decode() == name
@@ -193,8 +196,8 @@ def _with_pose(given: Sequence[str], poses: Mapping[str, pycolmap.Rigid3d] | Non
     return wanted
 
 
-def _check_usable(extracted: ExtractedImages, folder: Path) -> None:
-    usable = sum(len(image.features) > 0 for image in extracted.images)
+def _check_usable(extracted: ExtractionResult, folder: Path) -> None:
+    usable = extracted.num_usable
     if usable < MIN_IMAGES:
         msg = (
             f'{folder}: {usable} images can be used, a map needs at least {MIN_IMAGES}: '
@@ -204,111 +207,34 @@ def _check_usable(extracted: ExtractedImages, folder: Path) -> None:
         raise MapBuildError(msg)
 
 
-def _describe_images(
-    images: Sequence[MappingImage], describer: GlobalDescriptor | None
-) -> _Retrieval:
-    if describer is None:
-        vlad = Vlad.train(np.concatenate([image.features.descriptors for image in images]))
-        described = [vlad.aggregate(image.features.descriptors) for image in images]
-        return _Retrieval(vlad, np.stack(described), vlad.codebook)
-    dimension = images[0].features.descriptors.shape[1]
-    described = [one.global_descriptor for one in images if one.global_descriptor is not None]
-    return _Retrieval(describer, np.stack(described), np.zeros((0, dimension), np.float32))
+def _frame(images: ImageSet, mapped: Sequence[str]) -> MapFrame:
+    """The frame of the given poses, seen from a round place near the cameras.
 
-
-def _match(
-    images: Sequence[MappingImage],
-    retrieval: _Retrieval,
-    options: MapBuildOptions,
-    progress: Progress,
-) -> dict[tuple[int, int], NDArray[np.int64]]:
-    """Matches of the pairs worth comparing, by indices of their images."""
-    pairs = choose_pairs(retrieval.global_descriptors)
-    matches: dict[tuple[int, int], NDArray[np.int64]] = {}
-    for done, (first, second) in enumerate(pairs, start=1):
-        matches[first, second] = mutual_nearest_neighbours(
-            images[first].features.descriptors,
-            images[second].features.descriptors,
-            _MIN_SIMILARITY[options.extractor],
-            _MAX_RATIO,
-        )
-        progress('match', done, len(pairs))
-    return matches
-
-
-def _reconstruct(sfm_input: SfmInput, mapper: str, timer: StepTimer, progress: Progress) -> _Model:
-    """Runs structure from motion in a temporary folder."""
-    with tempfile.TemporaryDirectory(prefix='map_build_') as folder, quiet_colmap():
-        work = Path(folder)
-        database = work / 'database.db'
-        progress('verify', 0, 1)
-        with timer.step('verify'):
-            write_database(database, sfm_input)
-            verified = verify_geometry(database)
-        progress('verify', 1, 1)
-        progress('sfm', 0, len(sfm_input.images))
-        with timer.step('sfm'):
-            models = _models(database, work, sfm_input, mapper, progress)
-        progress('sfm', len(sfm_input.images), len(sfm_input.images))
-    largest = models[0] if models else pycolmap.Reconstruction()
-    _check_model(largest, sfm_input, verified)
-    return _Model(
-        reconstruction=largest,
-        other_models=tuple(model.num_reg_images() for model in models[1:]),
-        pairs_matched=len(sfm_input.matches),
-        pairs_verified=verified,
-    )
-
-
-def _models(
-    database: Path,
-    work: Path,
-    sfm_input: SfmInput,
-    mapper: str,
-    progress: Progress,
-) -> list[pycolmap.Reconstruction]:
-    if sfm_input.camera_from_world is None:
-        return map_images(database, work, sfm_input, mapper, progress)
-    return [triangulate(database, work, sfm_input, sfm_input.camera_from_world)]
-
-
-def _images_with_points(model: pycolmap.Reconstruction) -> int:
-    return sum(image.has_pose and image.num_points3D > 0 for image in model.images.values())
-
-
-def _check_model(model: pycolmap.Reconstruction, sfm_input: SfmInput, verified: int) -> None:
-    """Refuses what is no map, with what to do about it.
-
-    Raises:
-        MapBuildError: Too few images found a place, or their points agree by chance alone.
+    A map stores points in single precision: of coordinates in the millions (UTM) it would keep
+    decimetres.
     """
-    placed = _images_with_points(model)
-    if placed < MIN_IMAGES:
-        found = f'{placed} images could be placed (needed: {MIN_IMAGES})'
-    elif model.compute_mean_track_length() < _MIN_MEAN_TRACK_LENGTH:
-        found = f'its points agree in {model.compute_mean_track_length():.1f} images, as by chance'
-    else:
-        return
-    advice = (
-        'take more images, overlapping by two thirds, from different positions, of surfaces with '
-        'texture'
-        if sfm_input.camera_from_world is None
-        else 'check the camera, and that the poses are camera_from_world as COLMAP has it'
-    )
-    msg = (
-        f'{len(sfm_input.images)} images do not make a map: of {len(sfm_input.matches)} image '
-        f'pairs {verified} show the same thing, and {found}; {advice}'
-    )
-    raise MapBuildError(msg)
+    poses = images.camera_from_world
+    if poses is None:
+        return MapFrame()
+    centre = np.mean([poses[name].tgt_origin_in_src() for name in mapped], axis=0)
+    x, y, z = (_ROUND_PLACE * round(float(value) / _ROUND_PLACE) for value in centre)
+    return MapFrame(translation=(x, y, z), metric=images.metric, source='the given camera poses')
+
+
+def _camera_from_sfm(images: ImageSet, frame: MapFrame) -> dict[str, pycolmap.Rigid3d] | None:
+    if images.camera_from_world is None:
+        return None
+    world_from_sfm = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array(frame.translation))
+    return {name: pose * world_from_sfm for name, pose in images.camera_from_world.items()}
 
 
 def _content(
-    model: pycolmap.Reconstruction, images: Sequence[MappingImage], retrieval: _Retrieval
+    model: pycolmap.Reconstruction, images: StoredImages, retrieval: Retrieval
 ) -> MapContent:
     described = describe_points(model, images)
     rows = list(described.images)
     return MapContent(
-        image_names=tuple(images[row].name for row in rows),
+        image_names=tuple(images.names[row] for row in rows),
         camera_from_sfm=tuple(model.image(image_id_of(row)).cam_from_world() for row in rows),
         points=described.points,
         descriptors=described.descriptors,
@@ -322,10 +248,11 @@ def _content(
 def _report(
     given: Sequence[str],
     wanted: Sequence[str],
-    extracted: ExtractedImages,
-    model: _Model,
+    extracted: ExtractionResult,
+    matched: Matched,
+    model: Model,
     content: MapContent,
-    timer: StepTimer,
+    steps: Steps,
 ) -> BuildReport:
     reconstruction = model.reconstruction
     reconstruction.update_point_3d_errors()
@@ -333,11 +260,11 @@ def _report(
     return BuildReport(
         images_given=len(given),
         images_registered=len(content.image_names),
-        unregistered=tuple(image.name for image in extracted.images if image.name not in mapped),
+        unregistered=tuple(name for name in extracted.images.names if name not in mapped),
         unreadable=dict(extracted.unreadable),
         without_pose=tuple(sorted(set(given).difference(wanted))),
         other_models=model.other_models,
-        pairs_matched=model.pairs_matched,
+        pairs_matched=len(matched.pairs),
         pairs_verified=model.pairs_verified,
         points=len(content.points),
         observations=len(content.observation_points),
@@ -346,24 +273,34 @@ def _report(
         cameras=tuple(
             format_camera(camera) for _, camera in sorted(reconstruction.cameras.items())
         ),
-        seconds={step: round(seconds, 2) for step, seconds in timer.seconds.items()},
+        seconds={step: round(seconds, 2) for step, seconds in steps.timer.seconds.items()},
+        reused=dict(steps.reused),
     )
+
+
+def _save(
+    out: Path, content: MapContent, manifest: Manifest, model: pycolmap.Reconstruction
+) -> None:
+    try:
+        save_map(out, content, manifest, model)
+    except OSError as err:
+        msg = f'{out}: cannot be written: {err.strerror or err}; make room and start again'
+        raise MapError(msg) from err
 
 
 def _manifest(
     images: ImageSet,
+    frame: MapFrame,
     extractor: LocalExtractor,
     describer: GlobalDescriptor,
     options: MapBuildOptions,
     report: BuildReport,
 ) -> Manifest:
-    frame = MapFrame()
-    if images.camera_from_world is not None:
-        frame = MapFrame(metric=images.metric, source='the given camera poses')
     return Manifest(
         extractor=extractor.identity,
         retrieval=describer.name,
         retrieval_weights_sha256=describer.weights_sha256,
+        descriptor_bits=options.descriptor_bits,
         frame=frame,
         counts={},
         build={

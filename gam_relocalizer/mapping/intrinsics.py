@@ -14,7 +14,6 @@ from gam_relocalizer.errors import CameraError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from gam_relocalizer.image_set import ImageSet
     from gam_relocalizer.mapping.extraction import MappingImage
@@ -54,7 +53,7 @@ def assign_cameras(images: ImageSet, extracted: Sequence[MappingImage]) -> Image
     given: set[int] = set()
     for image in extracted:
         known = images.cameras.get(image.name)
-        camera = known or _guessed_camera(images.folder / image.name, image)
+        camera = known or image.exif_camera or _guessed_camera(image)
         # a guess that happens to equal a given camera is still another one, to be refined
         key = f'{known is not None} {format_camera(camera)}'
         if key not in index_of:
@@ -77,14 +76,8 @@ def _check_size(image: MappingImage, camera: pycolmap.Camera) -> None:
         raise CameraError(msg)
 
 
-def _guessed_camera(path: Path, image: MappingImage) -> pycolmap.Camera:
-    """The camera of the EXIF data, else one with a usual angle of view."""
-    try:
-        camera = pycolmap.infer_camera_from_image(path)
-    except (ValueError, RuntimeError):  # a format that OpenCV reads and COLMAP does not
-        camera = None
-    if camera is not None and (camera.width, camera.height) == (image.width, image.height):
-        return camera
+def _guessed_camera(image: MappingImage) -> pycolmap.Camera:
+    """One with a usual angle of view."""
     focal = _GUESSED_FOCAL_PER_SIDE * max(image.width, image.height)
     return pycolmap.Camera.create_from_model_name(
         1, _GUESSED_MODEL, focal, image.width, image.height

@@ -11,9 +11,44 @@ import numpy as np
 import torch
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
+    from gam_relocalizer.mapping.extraction import MappingImage
+    from gam_relocalizer.mapping.progress import Progress
+
+# Least cosine of two descriptors that may be the same point.
+_MIN_SIMILARITY = {'xfeat': 0.82, 'sift': 0.80}
+# Repeated windows and tiles lead whole images astray; a mild test costs one true match in six.
+_MAX_RATIO = 0.95
 _BLOCK = 4096
+
+
+def match_pairs(
+    images: Sequence[MappingImage],
+    pairs: Sequence[tuple[int, int]],
+    extractor: str,
+    progress: Progress,
+) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Matches of pairs of images, [K,2] indices of keypoints by the indices of the images.
+
+    Args:
+        images: With descriptors of one extractor.
+        pairs: Indices of images.
+        extractor: Its name, which tells how alike descriptors of one thing are.
+        progress: Told of the step match.
+    """
+    matches: dict[tuple[int, int], NDArray[np.int64]] = {}
+    for done, (first, second) in enumerate(pairs, start=1):
+        matches[first, second] = mutual_nearest_neighbours(
+            images[first].features.descriptors,
+            images[second].features.descriptors,
+            _MIN_SIMILARITY[extractor],
+            _MAX_RATIO,
+        )
+        progress('match', done, len(pairs))
+    return matches
 
 
 def mutual_nearest_neighbours(

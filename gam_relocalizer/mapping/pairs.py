@@ -41,3 +41,18 @@ def choose_pairs(global_descriptors: NDArray[np.float32]) -> list[tuple[int, int
     for image, others in enumerate(similar.tolist()):
         pairs.update((min(image, other), max(image, other)) for other in others)
     return sorted((first, second) for first, second in pairs if first != second)
+
+
+def choose_pairs_between(likeness: NDArray[np.float32]) -> list[tuple[int, int]]:
+    """Pairs of images of two sets to match.
+
+    Args:
+        likeness: [A,B] how much each image of the one set looks like each of the other.
+
+    Returns:
+        Sorted pairs of indices: all of them in small sets, else the most alike for each of the A.
+    """
+    if sum(likeness.shape) <= EXHAUSTIVE_UP_TO:
+        return [(int(one), int(other)) for one, other in np.ndindex(likeness.shape)]
+    similar = np.argsort(-likeness, axis=1, kind='stable')[:, :RETRIEVED_NEIGHBOURS]
+    return sorted((one, other) for one, others in enumerate(similar.tolist()) for other in others)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -30,6 +30,8 @@ class BuildReport:
         mean_reprojection_error: Over all observations [px].
         cameras: Final intrinsics, one line each.
         seconds: Time per step.
+        reused: Step to the number of images, pairs of images, and images of the model that were
+            found finished in the workspace.
     """
 
     images_given: int
@@ -46,6 +48,7 @@ class BuildReport:
     mean_reprojection_error: float
     cameras: tuple[str, ...]
     seconds: Mapping[str, float]
+    reused: Mapping[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for the manifest."""

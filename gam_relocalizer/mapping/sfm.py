@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -32,6 +35,10 @@ _THREADS = 1
 _MIN_INLIERS = 30
 _MIN_INLIER_RATIO = 0.3
 _MAX_TRIALS = 2000
+# What COLMAP's incremental mapper filters by.
+_MAX_ERROR_PX = 4.0
+_MIN_ANGLE_DEG = 1.5
+_MAX_ADJUSTMENTS = 50
 
 
 @dataclass(frozen=True)
@@ -43,14 +50,14 @@ class SfmInput:
         cameras: Of these images.
         constant_cameras: Ids of the cameras whose intrinsics are kept as they are.
         matches: (first, second) image index to [K,2] keypoint indices.
-        camera_from_world: By name of image, where all poses are known.
+        camera_from_sfm: By name of image, where all poses are known.
     """
 
     images: Sequence[MappingImage]
     cameras: ImageCameras
     constant_cameras: frozenset[int]
-    matches: Mapping[tuple[int, int], NDArray[np.int64]]
-    camera_from_world: Mapping[str, pycolmap.Rigid3d] | None = None
+    matches: Mapping[tuple[int, int], NDArray[np.integer]]
+    camera_from_sfm: Mapping[str, pycolmap.Rigid3d] | None = None
 
     @property
     def all_cameras_constant(self) -> bool:
@@ -98,22 +105,55 @@ def write_database(path: Path, sfm_input: SfmInput) -> None:
             )
 
 
-def verify_geometry(database_path: Path) -> int:
-    """Keeps matches that agree with one epipolar geometry or homography.
+def write_geometries(
+    path: Path, geometries: Mapping[tuple[int, int], pycolmap.TwoViewGeometry]
+) -> None:
+    """Adds what `verify_pairs` found to a database of the same images."""
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for (first, second), geometry in geometries.items():
+            database.write_two_view_geometry(image_id_of(first), image_id_of(second), geometry)
+
+
+def verify_pairs(
+    images: Sequence[MappingImage],
+    cameras: ImageCameras,
+    matches: Mapping[tuple[int, int], NDArray[np.integer]],
+) -> dict[tuple[int, int], pycolmap.TwoViewGeometry]:
+    """Those matches of each pair of images that agree with one epipolar geometry or homography.
+
+    Keypoints whose ray the camera model does not know have no match: COLMAP would give them a wrong
+    ray.
+
+    Args:
+        images: With keypoints.
+        cameras: Of these images.
+        matches: (first, second) image index to [K,2] keypoint indices.
 
     Returns:
-        Number of image pairs that hold.
+        For each pair; one that does not hold has no inlier matches.
     """
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = _SEED
-    options.ransac.max_num_trials = _MAX_TRIALS
-    options.min_num_inliers = _MIN_INLIERS
-    options.min_inlier_ratio = _MIN_INLIER_RATIO
-    options.compute_relative_pose = True
-    pycolmap.geometric_verification(database_path, two_view_geometry_options=options)
-    with pycolmap.Database.open(database_path) as database:
-        _, geometries = database.read_two_view_geometries()
-    return sum(len(geometry.inlier_matches) > 0 for geometry in geometries)
+    pixels = {
+        index: images[index].features.keypoints.astype(np.float64)
+        for index in {index for pair in matches for index in pair}
+    }
+    known = {index: have_known_rays(one, cameras.of(index)) for index, one in pixels.items()}
+
+    def verify(pair: tuple[int, int]) -> pycolmap.TwoViewGeometry:
+        first, second = pair
+        matched = matches[pair]
+        usable = matched[known[first][matched[:, 0]] & known[second][matched[:, 1]]]
+        return pycolmap.estimate_two_view_geometry(
+            cameras.of(first),
+            pixels[first],
+            cameras.of(second),
+            pixels[second],
+            usable.astype(np.uint32),
+            _two_view_options(),
+        )
+
+    # every pair starts from the same seed: the number of threads changes nothing
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(matches, pool.map(verify, matches), strict=True))
 
 
 def map_images(
@@ -140,7 +180,7 @@ def triangulate(
     database_path: Path,
     work: Path,
     sfm_input: SfmInput,
-    camera_from_world: Mapping[str, pycolmap.Rigid3d],
+    camera_from_sfm: Mapping[str, pycolmap.Rigid3d],
 ) -> pycolmap.Reconstruction:
     """Points from images with known poses; the model lies in the frame and scale of the poses."""
     pycolmap.set_random_seed(_SEED)
@@ -149,7 +189,7 @@ def triangulate(
         model.add_camera_with_trivial_rig(camera)
     for index, image in enumerate(sfm_input.images):
         model.add_image_with_trivial_frame(
-            _colmap_image(index, image, sfm_input), camera_from_world[image.name]
+            _colmap_image(index, image, sfm_input), camera_from_sfm[image.name]
         )
     options = pycolmap.IncrementalPipelineOptions()
     _set_incremental_options(options, sfm_input)
@@ -161,6 +201,131 @@ def triangulate(
         options=options,
         refine_intrinsics=not sfm_input.all_cameras_constant,
     )
+
+
+def add_images(
+    database_path: Path,
+    work: Path,
+    sfm_input: SfmInput,
+    model: pycolmap.Reconstruction,
+    progress: Progress,
+) -> pycolmap.Reconstruction:
+    """Finds places for further images in a model whose images stay exactly where they are.
+
+    Points may gain and lose observations and move a little, and there are new ones.
+
+    Args:
+        database_path: With verified matches of the further images.
+        work: Folder for intermediate files.
+        sfm_input: What the database was made of: first the images of the model, with their ids,
+            then the others.
+        model: To start from.
+        progress: Told of every registered image.
+    """
+    pycolmap.set_random_seed(_SEED)
+    start = work / 'start'
+    start.mkdir()
+    model.write_binary(start)
+    options = pycolmap.IncrementalPipelineOptions()
+    _set_incremental_options(options, sfm_input)
+    options.fix_existing_frames = True
+    options.multiple_models = False
+    # those of the model are not matched with each other, and would count as unconnected
+    options.load_all_images = True
+    total, registered = len(sfm_input.images) - model.num_reg_images(), 0
+
+    def count_image() -> None:
+        nonlocal registered
+        registered = min(registered + 1, total)
+        progress('sfm', registered, total)
+
+    models = pycolmap.incremental_mapping(
+        database_path,
+        work,
+        work,
+        options=options,
+        input_path=start,
+        next_image_callback=count_image,
+    )
+    return max(models.values(), key=lambda one: one.num_reg_images(), default=model)
+
+
+def adjust_images(
+    model: pycolmap.Reconstruction, image_ids: Sequence[int], shared_points: Sequence[int]
+) -> None:
+    """Bundle adjustment of some images of a model; all others, and all cameras, stay.
+
+    Observations that do not fit afterwards are taken from the points of these images.
+
+    Args:
+        model: Changed in place.
+        image_ids: Of the images that may move.
+        shared_points: Ids of points that other images see as well: what ties these to the others.
+    """
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in image_ids:
+        config.add_image(image_id)
+    for point_id in shared_points:
+        config.add_variable_point(point_id)
+    for camera_id in model.cameras:
+        config.set_constant_cam_intrinsics(camera_id)
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.solver_options.num_threads = _THREADS
+    options.ceres.solver_options.max_num_iterations = _MAX_ADJUSTMENTS
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    seen = {
+        point.point3D_id
+        for image_id in image_ids
+        for point in model.image(image_id).get_observation_points2D()
+    }
+    pycolmap.ObservationManager(model).filter_points3D(_MAX_ERROR_PX, _MIN_ANGLE_DEG, seen)
+
+
+def numbered_by_sight(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The same model, its points numbered 1, 2, ... in the order in which images come to see them.
+
+    Points are ordered by the first image that observes them, then by the last: what is seen
+    together has neighbouring ids, and so neighbouring rows in a map.
+    """
+    ids = np.array(sorted(model.point3D_ids()), dtype=np.int64)
+    seen = np.array([_first_and_last_image(model.point3D(int(one))) for one in ids]).reshape(-1, 2)
+    order = np.lexsort((ids, seen[:, 1], seen[:, 0]))
+    numbered = pycolmap.Reconstruction(model)
+    for one in ids:
+        numbered.delete_point3D(int(one))
+    for new, old in enumerate(ids[order], start=1):
+        numbered.add_point3D_with_id(new, model.point3D(int(old)))
+    return numbered
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Writes COLMAP's binary files; unlike COLMAP itself, it notices when the disk is full.
+
+    Raises:
+        OSError: The disk is full.
+    """
+    model.write_binary(folder)
+    last = folder / 'points3D.bin'
+    expected = 8 + 51 * model.num_points3D() + 8 * model.compute_num_observations()
+    if last.stat().st_size != expected:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(last))
+
+
+def _first_and_last_image(point: pycolmap.Point3D) -> tuple[int, int]:
+    images = [element.image_id for element in point.track.elements]
+    return min(images), max(images)
+
+
+def _two_view_options() -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = _SEED
+    options.ransac.max_num_trials = _MAX_TRIALS
+    options.min_num_inliers = _MIN_INLIERS
+    options.min_inlier_ratio = _MIN_INLIER_RATIO
+    options.compute_relative_pose = True
+    return options
 
 
 def _map_incrementally(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import cv2
@@ -11,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 from corner_room import CAMERA, CornerRoom, looking_into_the_corner
+from full_disk import files_no_larger_than
 
 from gam_relocalizer.cameras import parse_camera
 from gam_relocalizer.errors import (
@@ -73,6 +75,55 @@ def test_given_poses_are_kept(posed_map: BuiltMap, room: Room) -> None:
         assert error.rotation_deg < 1e-6
 
 
+def test_rows_of_points_are_the_points_of_the_colmap_model_in_order_of_sight(
+    posed_map: BuiltMap,
+) -> None:
+    scene_map = load_map(posed_map.path)
+    model = pycolmap.Reconstruction(posed_map.path / 'sfm')
+
+    assert sorted(model.point3D_ids()) == list(range(1, len(scene_map.points) + 1))
+    np.testing.assert_allclose(
+        scene_map.points,
+        [model.point3D(row + 1).xyz for row in range(len(scene_map.points))],
+        atol=1e-6,
+    )
+    first_seen = np.full(len(scene_map.points), scene_map.num_images)
+    for image in reversed(range(scene_map.num_images)):
+        first_seen[scene_map.points_seen_by(image)] = image
+    assert (np.diff(first_seen) >= 0).all()
+
+
+def test_poses_far_from_their_origin_give_the_same_accuracy(
+    posed_map: BuiltMap, room: Room, tmp_path: Path
+) -> None:
+    utm_from_room = np.array([500_123.25, 4_000_987.5, 212.75])
+    room_from_utm = pycolmap.Rigid3d(pycolmap.Rotation3d(), -utm_from_room)
+    poses = {name: pose * room_from_utm for name, pose in room.poses.items()}
+    images = ImageSet.of_folder(room.images, CAMERA, poses)
+
+    build_map(images, tmp_path / 'map', MapBuildOptions(max_keypoints=600))
+
+    near, far = load_map(posed_map.path), load_map(tmp_path / 'map')
+    assert np.abs(far.manifest.frame.translation - utm_from_room).max() < 1000
+    assert np.median(distance_to_walls(far.points - utm_from_room)) == pytest.approx(
+        np.median(distance_to_walls(near.points)), rel=0.02
+    )
+    for name, camera_from_map in zip(far.image_names, far.camera_from_map, strict=True):
+        error = pose_error(camera_from_map, poses[name])
+        assert error.position < 1e-5
+        assert error.rotation_deg < 1e-6
+
+
+def test_poses_near_their_origin_keep_it(posed_map: BuiltMap) -> None:
+    assert load_map(posed_map.path).manifest.frame.translation == (0, 0, 0)
+
+
+def test_words_of_a_map_are_exact_in_half_precision(posed_map: BuiltMap) -> None:
+    words = load_map(posed_map.path).codebook
+
+    np.testing.assert_array_equal(words.astype(np.float16), words)
+
+
 def test_recovers_the_poses_up_to_a_similarity(free_map: BuiltMap, room: Room) -> None:
     scene_map = load_map(free_map.path)
 
@@ -98,7 +149,7 @@ def test_descriptors_recognise_their_points(posed_map: BuiltMap, room: Room) -> 
     image = cv2.imread(str(room.images / scene_map.image_names[3]))
     features = create_extractor('xfeat', 600).extract(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
     seen = scene_map.points_seen_by(3)
-    descriptors = scene_map.descriptors[seen].astype(np.float32)
+    descriptors = scene_map.descriptors_of(seen)
 
     pixels = CAMERA.img_from_cam(scene_map.camera_from_map[3] * scene_map.points[seen])
     best = (descriptors @ features.descriptors.T).argmax(axis=1)
@@ -113,7 +164,7 @@ def test_report_agrees_with_the_map(posed_map: BuiltMap) -> None:
 
     assert report.images_given == report.images_registered == scene_map.num_images
     assert report.points == len(scene_map.points)
-    assert report.observations == len(scene_map.observation_points)
+    assert report.observations == scene_map.manifest.counts['observations']
     assert report.mean_track_length == pytest.approx(report.observations / report.points)
     assert 0 < report.mean_reprojection_error < 1.5
     assert scene_map.manifest.build['report']['points'] == report.points
@@ -203,6 +254,67 @@ def test_names_what_was_left_out_and_why(room: Room, tmp_path: Path) -> None:
     assert (report.images_registered, report.images_given) == (8, 11)
 
 
+def test_the_folder_of_images_is_only_read(room: Room, tmp_path: Path) -> None:
+    images = tmp_path / 'images'
+    shutil.copytree(room.images, images)
+    images.chmod(0o555)
+    before = {path: path.stat().st_mtime_ns for path in (images, *images.iterdir())}
+
+    build_map(
+        ImageSet.of_folder(images, CAMERA),
+        tmp_path / 'map',
+        MapBuildOptions(max_keypoints=300),
+    )
+
+    assert {path: path.stat().st_mtime_ns for path in (images, *images.iterdir())} == before
+    images.chmod(0o755)
+
+
+def test_leaves_nothing_behind_but_the_map(
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / 'temporary').mkdir()
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path / 'temporary'))
+    images = ImageSet.of_folder(room.images, CAMERA, room.poses)
+
+    build_map(images, tmp_path / 'map', MapBuildOptions(max_keypoints=300))
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['map', 'temporary']
+    assert list((tmp_path / 'temporary').iterdir()) == []
+
+
+def test_what_is_no_image_is_named_and_left_out(room: Room, tmp_path: Path) -> None:
+    images = tmp_path / 'images'
+    shutil.copytree(room.images, images)
+    (images / 'empty.jpg').touch()
+    (images / 'text.png').write_text('no image')
+    with (images / 'huge.bmp').open('wb') as file:
+        file.truncate(2**40)  # takes no space
+    image_set = ImageSet.of_folder(images, CAMERA)
+    (images / 'view 00.png').unlink()
+
+    report = build_map(image_set, tmp_path / 'map', MapBuildOptions(max_keypoints=300))
+
+    assert sorted(report.unreadable) == ['empty.jpg', 'huge.bmp', 'text.png', 'view 00.png']
+    assert all(name in reason for name, reason in report.unreadable.items())
+    assert report.images_registered == 7
+
+
+def test_a_full_disk_leaves_the_old_map(room: Room, posed_map: BuiltMap, tmp_path: Path) -> None:
+    shutil.copytree(posed_map.path, tmp_path / 'map')
+    images = ImageSet.of_folder(room.images, CAMERA, room.poses)
+
+    def fill_disk(step: str, *_: int) -> None:
+        if step == 'save':
+            disk.enter_context(files_no_larger_than(10_000))
+
+    with ExitStack() as disk, pytest.raises(MapError, match='cannot be written'):
+        build_map(images, tmp_path / 'map', MapBuildOptions(max_keypoints=300), fill_disk)
+
+    assert load_map(tmp_path / 'map').manifest.map_id == load_map(posed_map.path).manifest.map_id
+    assert [path.name for path in tmp_path.iterdir()] == ['map']
+
+
 def write_noise(folder: Path, count: int) -> None:
     folder.mkdir()
     for index in range(count):
@@ -273,10 +385,15 @@ def test_output_below_a_file_is_refused(room: Room, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    'options', [MapBuildOptions(mapper='magic'), MapBuildOptions(extractor='magic')]
+    'options',
+    [
+        MapBuildOptions(mapper='magic'),
+        MapBuildOptions(extractor='magic'),
+        MapBuildOptions(descriptor_bits=7),
+    ],
 )
-def test_unknown_names_are_refused(room: Room, tmp_path: Path, options: MapBuildOptions) -> None:
-    with pytest.raises(UsageError, match='magic'):
+def test_unknown_options_are_refused(room: Room, tmp_path: Path, options: MapBuildOptions) -> None:
+    with pytest.raises(UsageError, match=r'magic|7 bits'):
         build_map(ImageSet.of_folder(room.images), tmp_path / 'map', options)
 
 

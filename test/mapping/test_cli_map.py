@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from gam_relocalizer.cameras import format_camera
 from gam_relocalizer.cli.map import app
-from gam_relocalizer.errors import MapError, UsageError
+from gam_relocalizer.errors import MapBuildError, MapError, UsageError
+from gam_relocalizer.mapping.workspace import open_workspace
 from gam_relocalizer.scene_map import load_map, read_manifest
 
 if TYPE_CHECKING:
@@ -43,6 +44,48 @@ def test_builds_a_map_from_images_camera_and_poses(room: Room, tmp_path: Path) -
     assert done.exit_code == 0
     assert '8 of 8' in done.stdout
     assert load_map(tmp_path / 'map').num_images == 8
+
+
+def build(room: Room, out: Path, *arguments: str) -> Result:
+    return run(
+        'build',
+        *('--images', str(room.images)),
+        *('--out', str(out)),
+        *('--camera', format_camera(CAMERA)),
+        *('--max-keypoints', '300'),
+        *arguments,
+    )
+
+
+def test_keeps_the_finished_steps_beside_the_map_until_told_otherwise(
+    room: Room, tmp_path: Path
+) -> None:
+    out, work = tmp_path / 'map', tmp_path / 'map.work'
+
+    first = build(room, out)
+    assert 'map.work,' in first.stdout
+    assert 'from the workspace' not in first.stdout
+    assert work.is_dir()
+
+    again = build(room, out, '--descriptor-bits', '8', '--discard-work')
+    assert 'match 28 pairs' in again.stdout
+    assert read_manifest(out).descriptor_bits == 8
+    assert not work.exists()
+
+
+def test_a_build_of_a_map_that_is_being_built_is_refused(room: Room, tmp_path: Path) -> None:
+    with open_workspace(tmp_path / 'map.work'):
+        refused = build(room, tmp_path / 'map')
+
+    assert isinstance(refused.exception, MapBuildError)
+    assert not (tmp_path / 'map').exists()
+
+
+def test_options_that_cannot_be_used_leave_nothing(room: Room, tmp_path: Path) -> None:
+    refused = build(room, tmp_path / 'map', '--descriptor-bits', '7')
+
+    assert isinstance(refused.exception, UsageError)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_info_as_json_is_the_manifest(posed_map: BuiltMap) -> None:

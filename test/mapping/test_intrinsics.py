@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from gam_relocalizer.cameras import format_camera, parse_camera
 from gam_relocalizer.errors import CameraError
+from gam_relocalizer.features import create_extractor
 from gam_relocalizer.features.local import LocalFeatures
 from gam_relocalizer.image_set import ImageSet
-from gam_relocalizer.mapping.extraction import MappingImage
+from gam_relocalizer.mapping.extraction import MappingImage, extract_images
 from gam_relocalizer.mapping.intrinsics import assign_cameras
+from gam_relocalizer.mapping.progress import ignore_progress
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -84,10 +87,51 @@ def test_guesses_one_camera_per_size(tmp_path: Path) -> None:
     assert [camera.mean_focal_length() for camera in assigned.cameras] == [1.2 * 64] * 2
 
 
-def test_guesses_a_camera_for_a_file_that_colmap_cannot_read(tmp_path: Path) -> None:
-    image = MappingImage('gone.png', 64, 48, NOTHING)
+EXIF_SUB_DIRECTORY, ORIENTATION, FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x8769, 0x0112, 0x920A, 0xA405
+SIDEWAYS = 6
 
-    (camera,) = assign_cameras(taken_by(None, [image], tmp_path), [image]).cameras
 
-    assert (camera.width, camera.height) == (64, 48)
-    assert camera.mean_focal_length() == pytest.approx(1.2 * 64)
+def write_photo(file: Path, orientation: int, *, focal_length_35mm: int = 28) -> None:
+    """A textured JPEG of 640 x 480 stored pixels, with the EXIF data that phones write."""
+    pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    photo = Image.fromarray(np.kron(pixels, np.ones((10, 10, 1), np.uint8)))
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    exif.get_ifd(EXIF_SUB_DIRECTORY).update(
+        {FOCAL_LENGTH: 4.0, FOCAL_LENGTH_35MM: focal_length_35mm}
+    )
+    photo.save(file, exif=exif)
+
+
+def extracted_from(folder: Path) -> list[MappingImage]:
+    names = sorted(file.name for file in folder.iterdir())
+    extractor = create_extractor('sift', 100)
+    return list(extract_images(folder, names, extractor, None, ignore_progress).images)
+
+
+def test_focal_length_comes_from_exif(tmp_path: Path) -> None:
+    write_photo(tmp_path / '0.jpg', 1)
+    write_photo(tmp_path / '1.jpg', 1, focal_length_35mm=50)
+    images = extracted_from(tmp_path)
+
+    assigned = assign_cameras(taken_by(None, images, tmp_path), images)
+
+    # the film is 36 mm wide, its diagonal 43.3 mm: programs differ in which of them they go by
+    assert assigned.of_image == (0, 1)
+    assert assigned.cameras[0].mean_focal_length() == pytest.approx(28 / 36 * 640, rel=0.05)
+    assert assigned.cameras[1].mean_focal_length() == pytest.approx(50 / 36 * 640, rel=0.05)
+    assert assigned.given == frozenset()
+
+
+def test_a_rotation_in_exif_changes_neither_pixels_nor_camera(tmp_path: Path) -> None:
+    write_photo(tmp_path / 'sideways.jpg', SIDEWAYS)
+    write_photo(tmp_path / 'upright.jpg', 1)
+    images = sideways, upright = extracted_from(tmp_path)
+
+    assigned = assign_cameras(taken_by(None, images, tmp_path), images)
+
+    assert (sideways.width, sideways.height) == (upright.width, upright.height) == (640, 480)
+    np.testing.assert_array_equal(sideways.features.keypoints, upright.features.keypoints)
+    assert assigned.of_image == (0, 0)
+    assert (assigned.cameras[0].width, assigned.cameras[0].height) == (640, 480)
+    assert assigned.cameras[0].mean_focal_length() == pytest.approx(28 / 36 * 640, rel=0.05)

@@ -10,6 +10,7 @@ from gam_relocalizer.mapping.pairs import (
     RETRIEVED_NEIGHBOURS,
     SEQUENTIAL_NEIGHBOURS,
     choose_pairs,
+    choose_pairs_between,
 )
 
 
@@ -51,3 +52,20 @@ def test_one_image_more_than_exhaustive_is_still_complete_near_by() -> None:
     pairs = set(choose_pairs(loop_descriptors(EXHAUSTIVE_UP_TO + 1)))
 
     assert all((image, image + 1) in pairs for image in range(EXHAUSTIVE_UP_TO))
+
+
+def test_two_small_sets_are_compared_completely() -> None:
+    pairs = choose_pairs_between(np.zeros((2, 3), np.float32))
+
+    assert pairs == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
+
+
+def test_of_two_large_sets_the_most_alike_are_compared() -> None:
+    likeness = np.random.default_rng(0).random((30, 50), dtype=np.float32)
+
+    pairs = choose_pairs_between(likeness)
+
+    assert len(pairs) == 30 * RETRIEVED_NEIGHBOURS
+    for image, row in enumerate(likeness):
+        chosen = [other for one, other in pairs if one == image]
+        assert row[chosen].min() >= np.delete(row, chosen).max()
