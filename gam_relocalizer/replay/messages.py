@@ -4,27 +4,31 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gam_relocalizer.cameras import CameraCalibration
-from gam_relocalizer.errors import BagError
+from gam_relocalizer.errors import BagError, TransformError
 from gam_relocalizer.geometry import rigid3d_from
 from gam_relocalizer.images import decode_compressed, decode_image
-from gam_relocalizer.replay.bag import COMPRESSED_IMAGE
+from gam_relocalizer.replay.bag import COMPRESSED_IMAGE, nanoseconds
 
 if TYPE_CHECKING:
     import pycolmap
     from numpy.typing import NDArray
 
     from gam_relocalizer.replay.bag import BagMessage
+    from gam_relocalizer.transforms import TransformTree
 
 POSE_STAMPED = 'geometry_msgs/msg/PoseStamped'
 POSE_WITH_COVARIANCE_STAMPED = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 POSE_TYPES = (POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED, ODOMETRY)
+
+_LOG = logging.getLogger(__name__)
 
 
 def image_in(message: BagMessage) -> NDArray[np.uint8]:
@@ -113,6 +117,22 @@ def rigid_in(translation: Any, quaternion: Any) -> pycolmap.Rigid3d:  # noqa: AN
         msg = f'translation {xyz}, quaternion (w, x, y, z) {wxyz}'
         raise ValueError(msg)
     return rigid3d_from(wxyz, xyz)
+
+
+def add_transforms(tree: TransformTree, message: BagMessage, *, static: bool) -> None:
+    """Adds what is usable of a TFMessage, as tf2 does: a robot's tree often has a broken branch."""
+    for stamped in message.value.transforms:
+        transform = stamped.transform
+        try:
+            tree.add(
+                stamped.header.frame_id,
+                stamped.child_frame_id,
+                rigid_in(transform.translation, transform.rotation),
+                nanoseconds(stamped.header.stamp),
+                static=static,
+            )
+        except (TransformError, ValueError) as err:
+            _LOG.warning('%s: a transform is left out: %s', message.topic.name, err)
 
 
 def _floats(values: Any) -> tuple[float, ...]:  # noqa: ANN401 - an array of any library

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from bisect import bisect_right
 from dataclasses import dataclass, field, replace
@@ -24,16 +23,15 @@ from gam_relocalizer.replay.bag import (
     NANOSECONDS,
     find_camera_info_topic,
     find_image_topic,
-    nanoseconds,
     open_bag,
 )
 from gam_relocalizer.replay.messages import (
     ODOMETRY,
     POSE_TYPES,
+    add_transforms,
     calibration_in,
     image_in,
     pose_in,
-    rigid_in,
 )
 from gam_relocalizer.replay.result import Attempt, Illustration, OdometrySample, Replay
 from gam_relocalizer.transforms import TransformTree
@@ -55,8 +53,6 @@ TF_STATIC = '/tf_static'
 
 # A transform or odometry for the time of an image may be recorded a little after the image.
 DELAY_NS = NANOSECONDS
-
-_LOG = logging.getLogger(__name__)
 
 
 class Localizes(Protocol):
@@ -210,7 +206,7 @@ def _read_facts(bag: Bag, image_topic: Topic, options: ReplayOptions) -> _Facts:
     facts = _Facts()
     for message in bag.messages(topics):
         if message.topic.name == TF_STATIC:
-            _add_transforms(facts.transforms, message, static=True)
+            add_transforms(facts.transforms, message, static=True)
         elif message.topic.type == CAMERA_INFO:
             calibration = calibration_in(message)
             if not facts.calibrations or facts.calibrations[-1][1] != calibration:
@@ -262,7 +258,7 @@ class _Motion:
 
     def _take_in(self, message: BagMessage) -> None:
         if message.topic.name == TF:
-            _add_transforms(self._facts.transforms, message, static=False)
+            add_transforms(self._facts.transforms, message, static=False)
             return
         child_frame, base_frame = message.value.child_frame_id, self._options.base_frame
         if not is_odometry_of(child_frame, base_frame):
@@ -278,22 +274,6 @@ class _Motion:
         if is_newer and self._options.continuity.metric:
             truth = self._facts.truth_at(stamp_ns, self._options)
             self.odometry.append(OdometrySample(stamp_ns, odom_from_base, truth))
-
-
-def _add_transforms(tree: TransformTree, message: BagMessage, *, static: bool) -> None:
-    """Adds what is usable, as tf2 does: a robot's tree often has one broken branch."""
-    for stamped in message.value.transforms:
-        transform = stamped.transform
-        try:
-            tree.add(
-                stamped.header.frame_id,
-                stamped.child_frame_id,
-                rigid_in(transform.translation, transform.rotation),
-                nanoseconds(stamped.header.stamp),
-                static=static,
-            )
-        except (TransformError, ValueError) as err:
-            _LOG.warning('%s: a transform is left out: %s', message.topic.name, err)
 
 
 def _attempt(

@@ -11,10 +11,28 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gam_relocalizer.cli.map.printing import print_table, progress_bars, some_of
+from gam_relocalizer.cli.map.sources import (
+    BagOption,
+    BaseFrameOption,
+    CameraFrameOption,
+    CameraInfoTopicOption,
+    GpsTopicOption,
+    ImagesOption,
+    ImageTopicOption,
+    OdometryTopicOption,
+    RectifiedOption,
+    Sources,
+    VideoOption,
+    align_with,
+    images_of,
+)
 from gam_relocalizer.cli.options import GlobalWeightsOption
 
 if TYPE_CHECKING:
     from gam_relocalizer.mapping.report import BuildReport
+    from gam_relocalizer.mapping.workspace import Workspace
+
+_UNITS = {'extract': 'images', 'match': 'pairs', 'verify': 'pairs', 'sfm': 'images'}
 
 
 class Mapper(str, Enum):
@@ -25,7 +43,10 @@ class Mapper(str, Enum):
 
 
 def build(  # noqa: PLR0913 - one argument per option
-    images: Annotated[Path, typer.Option(help='Folder of images, searched with sub-folders.')],
+    *,
+    images: ImagesOption = None,
+    video: VideoOption = None,
+    bag: BagOption = None,
     out: Annotated[Path, typer.Option(help='The map bundle to write; replaced if it is one.')],
     camera: Annotated[
         str,
@@ -44,7 +65,6 @@ def build(  # noqa: PLR0913 - one argument per option
     extractor: Annotated[str, typer.Option(help='Local features: xfeat or sift.')] = 'xfeat',
     mapper: Annotated[Mapper, typer.Option(help='Used without poses.')] = Mapper.INCREMENTAL,
     max_keypoints: Annotated[int, typer.Option(min=1, help='Features per image.')] = 2048,
-    *,
     global_descriptor: Annotated[
         str,
         typer.Option(
@@ -58,19 +78,46 @@ def build(  # noqa: PLR0913 - one argument per option
     metric: Annotated[
         bool, typer.Option(help='Whether one unit of the given poses is a metre.')
     ] = True,
+    descriptor_bits: Annotated[
+        int, typer.Option(help='Kept of each number of a local descriptor: 16, or 8.')
+    ] = 16,
+    discard_work: Annotated[
+        bool,
+        typer.Option(
+            '--discard-work',
+            help='Remove the folder OUT.work, with the finished steps, when the map is complete.',
+        ),
+    ] = False,
+    image_topic: ImageTopicOption = None,
+    camera_info_topic: CameraInfoTopicOption = None,
+    image_is_rectified: RectifiedOption = False,
+    odom_topic: OdometryTopicOption = None,
+    gps_topic: GpsTopicOption = None,
+    base_frame: BaseFrameOption = None,
+    camera_frame: CameraFrameOption = None,
 ) -> None:
-    """Builds a map bundle from a folder of images."""
-    from gam_relocalizer.cameras import parse_camera
-    from gam_relocalizer.geometry import read_poses
-    from gam_relocalizer.image_set import ImageSet
-    from gam_relocalizer.mapping.build import MapBuildOptions, build_map
+    """Builds a map bundle from a folder of images, a video or a bag."""
+    from gam_relocalizer.mapping.build import MapBuildOptions, build_map, check_output
+    from gam_relocalizer.mapping.pictures import write_build_report
+    from gam_relocalizer.mapping.workspace import open_workspace, workspace_of
 
-    image_set = ImageSet.of_folder(
-        images,
-        parse_camera(camera) if camera else None,
-        read_poses(poses) if poses is not None else None,
+    sources = Sources(
+        images=images,
+        video=video,
+        bag=bag,
+        camera=camera,
+        poses=poses,
         metric=metric,
+        image_topic=image_topic,
+        camera_info_topic=camera_info_topic,
+        image_is_rectified=image_is_rectified,
+        odom_topic=odom_topic,
+        gps_topic=gps_topic,
+        base_frame=base_frame,
+        camera_frame=camera_frame,
     )
+    sources.check()
+    check_output(out)
     options = MapBuildOptions(
         refine_camera=refine_camera,
         extractor=extractor,
@@ -78,13 +125,21 @@ def build(  # noqa: PLR0913 - one argument per option
         mapper=mapper.value,
         global_descriptor=global_descriptor,
         global_weights=global_weights,
+        descriptor_bits=descriptor_bits,
     )
-    with progress_bars() as progress:
-        report = build_map(image_set, out, options, progress)
-    _print_build(report, out)
+    with open_workspace(workspace_of(out)) as workspace:
+        image_set, references = images_of(sources, workspace)
+        with progress_bars() as progress:
+            report = build_map(image_set, out, options, progress, workspace)
+        if discard_work:
+            workspace.discard()
+        _print_build(report, out, workspace)
+    if images is None:
+        align_with(references, out)
+    write_build_report(out, report, out.with_name(f'{out.name}.report'))
 
 
-def _print_build(report: BuildReport, out: Path) -> None:
+def _print_build(report: BuildReport, out: Path, workspace: Workspace) -> None:
     left_out = {
         'found no place': list(report.unregistered),
         'could not be read': list(report.unreadable),
@@ -103,4 +158,13 @@ def _print_build(report: BuildReport, out: Path) -> None:
     if report.other_models:
         sizes = ', '.join(map(str, report.other_models))
         rows['dropped models'] = f'separate pieces of {sizes} images'
+    if any(report.reused.values()):
+        rows['from the workspace'] = ', '.join(
+            f'{step} {count} {_UNITS[step]}' for step, count in report.reused.items() if count
+        )
+    if workspace.path.exists():
+        rows['workspace'] = (
+            f'{workspace.path.name}, {workspace.size / 2**20:.0f} MiB: finished steps, for a '
+            f'further build; may be deleted'
+        )
     print_table(f'{out}', rows)
