@@ -40,8 +40,8 @@ def replay(  # noqa: PLR0913 - the options of the command
     out: Annotated[
         Path,
         typer.Option(
-            help='Folder for poses.tum, fixes.mcap, summary.json and report.html; with odometry '
-            'also for corrected.tum.'
+            help='Folder for poses.tum, attempts.csv, fixes.mcap, summary.json and report.html; '
+            'with odometry also for corrected.tum.'
         ),
     ],
     *,
@@ -91,6 +91,7 @@ def replay(  # noqa: PLR0913 - the options of the command
     from gam_relocalizer.replay.summary import row_of
     from gam_relocalizer.replay.writing import (
         output_folder,
+        write_attempts,
         write_corrected,
         write_fixes,
         write_summary,
@@ -132,6 +133,7 @@ def replay(  # noqa: PLR0913 - the options of the command
         write_trajectory(folder, rows)
         if trajectories is not None:
             write_corrected(folder, trajectories)
+        write_attempts(folder, rows)
         write_fixes(folder, rows, map_frame)
         write_summary(folder, rows, facts, trajectories)
         write_report(folder, report)

@@ -10,18 +10,21 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pycolmap
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from gam_relocalizer.errors import ImageError, MapError, UsageError
 from gam_relocalizer.features.registry import create_extractor
 from gam_relocalizer.images import read_image
+from gam_relocalizer.map_encoding import unit_rows
 from gam_relocalizer.mapping.progress import ignore_progress
 from gam_relocalizer.mapping.sfm import quiet_colmap
-from gam_relocalizer.scene_map import SFM, verify_files
+from gam_relocalizer.scene_map import SFM, SceneMap, verify_files
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,12 +34,13 @@ if TYPE_CHECKING:
 
     from gam_relocalizer.features.local import LocalExtractor
     from gam_relocalizer.mapping.progress import Progress
-    from gam_relocalizer.scene_map import SceneMap
 
 NO_POINT = -1
 # Keypoints of the same image and extractor agree to rounding, but for a few of the faintest.
 _SAME_KEYPOINT_PX = 0.01
 _MIN_KNOWN_KEYPOINTS = 0.9
+# Nothing is triangulated from fewer images.
+_MIN_TRACK = 2
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,12 @@ class ReferenceImages:
     scene_map: SceneMap
     images: tuple[ReferenceImage, ...]
     descriptor_sums: NDArray[np.float32]
+
+    @cached_property
+    def track_lengths(self) -> NDArray[np.int64]:
+        """[N] number of images that see each point."""
+        seen = [self.scene_map.points_seen_by(image) for image in range(len(self.images))]
+        return np.bincount(np.concatenate(seen), minlength=len(self.descriptor_sums))
 
 
 @dataclass(frozen=True)
@@ -120,6 +130,15 @@ def read_reference_images(
     return ReferenceImages(scene_map, tuple(images), _descriptor_sums(images, scene_map))
 
 
+def reference_cameras(scene_map: SceneMap) -> tuple[pycolmap.Camera, ...]:
+    """The intrinsics of each reference image of a map with a COLMAP model.
+
+    Raises:
+        MapError: The map has no COLMAP model, or one that does not fit it.
+    """
+    return tuple(image.camera for image in _read_observed_images(scene_map))
+
+
 def leave_out(references: ReferenceImages, image: int) -> LeftOutView:
     """Takes an image out of its map: from the means of its points, and from retrieval.
 
@@ -132,7 +151,7 @@ def leave_out(references: ReferenceImages, image: int) -> LeftOutView:
 
     observes = np.flatnonzero(left_out.point_of_keypoint != NO_POINT)
     observed = left_out.point_of_keypoint[observes]
-    row_of_point = np.full(len(scene_map.points), NO_POINT)
+    row_of_point = np.full(scene_map.num_points, NO_POINT)
     row_of_point[points] = np.arange(len(points))
     true_rows = np.full(len(left_out.keypoints), NO_POINT)
     true_rows[observes] = row_of_point[observed]
@@ -140,18 +159,122 @@ def leave_out(references: ReferenceImages, image: int) -> LeftOutView:
     sums = references.descriptor_sums[points]
     inside = true_rows != NO_POINT
     np.subtract.at(sums, true_rows[inside], left_out.descriptors[inside])
-    norms = np.linalg.norm(sums, axis=1, keepdims=True)
     return LeftOutView(
         image=image,
         reference=_retrieved_without(scene_map, image),
         points=points,
-        point_descriptors=sums / np.maximum(norms, np.finfo(np.float32).tiny),
+        point_descriptors=unit_rows(sums),
         true_rows=true_rows,
     )
 
 
+@dataclass(frozen=True)
+class MapWithout(SceneMap):
+    """A map as if one of its reference images had never been taken; made in no time.
+
+    Points keep their indices. A point that only one other image sees is seen by none here: it would
+    not have been triangulated. The others keep their places, though the image helped to find them.
+
+    Attributes:
+        whole: The map with the image.
+        image: The image left out, an index of the whole map.
+        points_lost: [L] int64 rising indices of the points it sees and at most one other image.
+        points_changed: [K] int64 rising indices of the other points it sees.
+        changed_descriptors: [K,D] float32 their mean descriptors without it, of length one.
+    """
+
+    whole: SceneMap
+    image: int
+    points_lost: NDArray[np.int64]
+    points_changed: NDArray[np.int64]
+    changed_descriptors: NDArray[np.float32]
+
+    def points_seen_by(self, image: int) -> NDArray[np.int32]:
+        """See `SceneMap`."""
+        seen = self.whole.points_seen_by(int(self._others[image]))
+        return seen[~np.isin(seen, self.points_lost)]
+
+    def observations(self) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """See `SceneMap`."""
+        seen = [self.points_seen_by(image) for image in range(self.num_images)]
+        offsets = np.cumsum([0, *map(len, seen)], dtype=np.int64)
+        return offsets, np.concatenate([np.empty(0, np.int32), *seen])
+
+    def descriptors_of(self, points: NDArray[np.integer]) -> NDArray[np.float32]:
+        """See `SceneMap`."""
+        descriptors = self.whole.descriptors_of(points)
+        changed = np.isin(points, self.points_changed)
+        rows = np.searchsorted(self.points_changed, points[changed])
+        descriptors[changed] = self.changed_descriptors[rows]
+        return descriptors
+
+    def likeness(self, global_descriptor: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `SceneMap`."""
+        return self.whole.likeness(global_descriptor)[self._others]
+
+    def global_descriptor_of(self, image: int) -> NDArray[np.float32]:
+        """See `SceneMap`."""
+        return self.whole.global_descriptor_of(int(self._others[image]))
+
+    @cached_property
+    def covisibility(self) -> csr_matrix:
+        """See `SceneMap`."""
+        # a lost point had one other observer: no two of them shared it
+        covisibility = csr_matrix(self.whole.covisibility[self._others][:, self._others])
+        covisibility.setdiag(self.num_points_seen)
+        covisibility.eliminate_zeros()
+        return covisibility
+
+    @cached_property
+    def _others(self) -> NDArray[np.int64]:
+        """[I-1] the images of this map, by their indices in the whole one."""
+        return np.delete(np.arange(self.whole.num_images), self.image)
+
+
+def map_without(references: ReferenceImages, image: int) -> MapWithout:
+    """The whole map but for one image, for a localizer."""
+    whole = references.scene_map
+    seen = whole.points_seen_by(image).astype(np.int64)
+    enough = references.track_lengths[seen] > _MIN_TRACK
+    changed, lost = seen[enough], seen[~enough]
+    others = np.delete(np.arange(whole.num_images), image)
+    return MapWithout(
+        path=whole.path,
+        manifest=whole.manifest,
+        image_names=tuple(whole.image_names[other] for other in others),
+        camera_from_map=tuple(whole.camera_from_map[other] for other in others),
+        num_points_seen=(whole.num_points_seen - _seen_by_each(whole, image, lost))[others],
+        stored=whole.stored,
+        whole=whole,
+        image=image,
+        points_lost=lost,
+        points_changed=changed,
+        changed_descriptors=_descriptors_without(references, image, changed),
+    )
+
+
+def _seen_by_each(scene_map: SceneMap, image: int, points: NDArray[np.int64]) -> NDArray[np.int64]:
+    """[I] how many of some points of an image each image sees."""
+    counts = np.zeros(scene_map.num_images, np.int64)
+    for one in scene_map.covisible_with(np.array([image])):
+        counts[one] = np.isin(points, scene_map.points_seen_by(one)).sum()
+    return counts
+
+
+def _descriptors_without(
+    references: ReferenceImages, image: int, points: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """[K,D] mean descriptors, of length one, of points [K] that other images see, too."""
+    left_out = references.images[image]
+    keypoints = np.flatnonzero(np.isin(left_out.point_of_keypoint, points))
+    rows = np.searchsorted(points, left_out.point_of_keypoint[keypoints])
+    sums = references.descriptor_sums[points]
+    np.subtract.at(sums, rows, left_out.descriptors[keypoints])
+    return unit_rows(sums)
+
+
 def _retrieved_without(scene_map: SceneMap, image: int) -> int:
-    scores = scene_map.global_descriptors @ scene_map.global_descriptors[image]
+    scores = scene_map.likeness(scene_map.global_descriptor_of(image))
     scores[image] = -np.inf
     return int(np.argmax(scores))
 
@@ -215,10 +338,10 @@ def _read_model(scene_map: SceneMap) -> pycolmap.Reconstruction:
     except (ValueError, RuntimeError) as err:
         msg = f'{scene_map.path / SFM}: cannot be read as a COLMAP model: {err}'
         raise MapError(msg) from err
-    if model.num_points3D() != len(scene_map.points):
+    if model.num_points3D() != scene_map.num_points:
         msg = (
             f'{scene_map.path / SFM}: {model.num_points3D()} points, the map has '
-            f'{len(scene_map.points)}; build it again with `map build`'
+            f'{scene_map.num_points}; build it again with `map build`'
         )
         raise MapError(msg)
     return model
@@ -278,7 +401,7 @@ def _same_keypoints(
 
 
 def _descriptor_sums(images: Sequence[ReferenceImage], scene_map: SceneMap) -> NDArray[np.float32]:
-    shape = len(scene_map.points), scene_map.manifest.extractor.dimension
+    shape = scene_map.num_points, scene_map.manifest.extractor.dimension
     sums = np.zeros(shape, np.float32)
     for image in images:
         observes = image.point_of_keypoint != NO_POINT

@@ -4,16 +4,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.collections import EllipseCollection, PathCollection
 from matplotlib.figure import Figure
 
-from gam_relocalizer.geometry import rotation_of
 from gam_relocalizer.localization.result import Status
+from gam_relocalizer.plots import (
+    LABEL_SIZE,
+    POINT,
+    REFERENCE,
+    View,
+    dots,
+    fit_axes,
+    thinned,
+    unit_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -28,51 +35,10 @@ if TYPE_CHECKING:
     from gam_relocalizer.scene_map import SceneMap
 
 FIX, TRUTH, REFUSED, INLIER, REPROJECTED = '#0b62c4', '#111111', '#d62728', '#2bd34a', '#ff9d00'
-POINT, REFERENCE = '#8a8f98', '#c9a227'
 ODOMETRY, CORRECTED = '#f2a33a', '#2ca089'
 STAGE_COLOURS = ('#0b62c4', '#2ca089', '#f2a33a', '#b04fa8', '#777777')
 
-MAX_POINTS_DRAWN = 60_000
 SIGMAS = 3.0
-DPI = 120
-
-LABEL_SIZE = 9
-
-
-@dataclass(frozen=True)
-class View:
-    """The map seen from above.
-
-    Attributes:
-        axes: [2,3] directions of the picture's right and top, in the map frame.
-        labels: What the two axes of the picture are.
-    """
-
-    axes: NDArray[np.float64]
-    labels: tuple[str, str]
-
-    @staticmethod
-    def from_above(scene_map: SceneMap) -> View:
-        """Looks down the map's z axis if that is vertical, else down the cameras' own vertical.
-
-        Cameras are held upright more or less: the mean of their upward directions tells where up
-        is in a map whose frame says nothing about gravity.
-        """
-        unit = 'm' if scene_map.manifest.frame.metric else 'map units'
-        downs = [rotation_of(pose).as_matrix()[1] for pose in scene_map.camera_from_map]
-        up = -np.sum(downs, axis=0)
-        length = float(np.linalg.norm(up))
-        if length < 1e-6 or up[2] > length * np.cos(np.radians(30.0)):
-            return View(np.eye(3)[:2], (f'x [{unit}]', f'y [{unit}]'))
-        up = up / length
-        sideways = np.eye(3)[np.argmin(np.abs(up))]
-        right = sideways - up * (up @ sideways)
-        right /= np.linalg.norm(right)
-        return View(np.array([right, np.cross(up, right)]), (f'across [{unit}]', f'along [{unit}]'))
-
-    def of(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """[N,2] of [N,3]."""
-        return np.asarray(positions, dtype=float).reshape(-1, 3) @ self.axes.T
 
 
 def trajectory_figure(rows: Sequence[Row], scene_map: SceneMap) -> Figure:
@@ -85,28 +51,28 @@ def trajectory_figure(rows: Sequence[Row], scene_map: SceneMap) -> Figure:
 def draw_trajectory(axes: Axes, rows: Sequence[Row], scene_map: SceneMap) -> None:
     """Map points, reference cameras, fixes with their covariances, and the truth, from above."""
     view = View.from_above(scene_map)
-    points = view.of(_thinned(scene_map.points))
+    points = view.of(thinned(scene_map.points))
     cameras = view.of(np.array([pose.tgt_origin_in_src() for pose in scene_map.camera_from_map]))
     fixes = [row.robot_pose for row in rows if row.robot_pose is not None]
     positions = view.of(np.array([fix.map_from_base.translation for fix in fixes]))
     truth = view.of(np.array([row.truth.translation for row in rows if row.truth is not None]))
-    _dots(axes, points, s=1.2, c=POINT, alpha=0.5, label='map points')
-    _dots(axes, cameras, s=7, c=REFERENCE, label='reference images')
+    dots(axes, points, s=1.2, c=POINT, alpha=0.5, label='map points')
+    dots(axes, cameras, s=7, c=REFERENCE, label='reference images')
     if len(truth):
         axes.plot(*truth.T, '-', color=TRUTH, linewidth=1.0, label='ground truth')
     axes.plot(*positions.T, '-', color=FIX, linewidth=0.6, alpha=0.5)
-    _dots(axes, positions, s=12, c=FIX, zorder=4, label=f'fixes, {SIGMAS:.0f}-sigma')
+    dots(axes, positions, s=12, c=FIX, zorder=4, label=f'fixes, {SIGMAS:.0f}-sigma')
     if fixes:
         spreads = [view.axes @ fix.covariance[:3, :3] @ view.axes.T for fix in fixes]
         _draw_ellipses(axes, positions, np.array(spreads))
     refused = [row.truth for row in rows if row.robot_pose is None and row.truth is not None]
     if refused:
         where = view.of(np.array([truth.translation for truth in refused]))
-        _dots(
+        dots(
             axes, where, s=26, c=REFUSED, marker='x', linewidths=1.2, zorder=4,
             label='refused (at the truth)',
         )  # fmt: skip
-    _frame(axes, points, np.concatenate([cameras, positions, truth]))
+    fit_axes(axes, points, np.concatenate([cameras, positions, truth]))
     axes.set_xlabel(view.labels[0], fontsize=LABEL_SIZE)
     axes.set_ylabel(view.labels[1], fontsize=LABEL_SIZE)
     legend = axes.legend(loc='upper right', fontsize=8, framealpha=0.9, borderpad=0.5)
@@ -231,16 +197,19 @@ def draw_matches(axes: Axes, illustration: Illustration, scene_map: SceneMap) ->
     axes.imshow(image, cmap='gray', vmin=0, vmax=255, extent=(0, width, height, 0))
     keypoints = np.asarray(estimate.inlier_keypoints, dtype=float)
     in_camera = np.array(
-        [estimate.camera_from_map * point for point in scene_map.points[estimate.inlier_points]]
+        [
+            estimate.camera_from_map * point
+            for point in scene_map.positions_of(estimate.inlier_points)
+        ]
     ).reshape(-1, 3)
     reprojected = np.asarray(camera.img_from_cam(in_camera)).reshape(-1, 2)
     residuals = np.stack([keypoints, reprojected]).transpose(2, 0, 1)
     axes.plot(*residuals, '-', color=REPROJECTED, linewidth=0.8)
-    _dots(
+    dots(
         axes, keypoints, s=16, facecolors='none', edgecolors=INLIER, linewidths=0.9,
         label=f'{estimate.inliers} inliers',
     )  # fmt: skip
-    _dots(axes, reprojected, s=2.5, c=REPROJECTED, label='map points, reprojected')
+    dots(axes, reprojected, s=2.5, c=REPROJECTED, label='map points, reprojected')
     axes.set_xlim(0, width)
     axes.set_ylim(height, 0)
     axes.set_axis_off()
@@ -266,18 +235,11 @@ def overview_figure(
         matches.set_axis_off()
     below = figure.add_subplot(grid[1, 1])
     if any(row.error for row in rows):
-        draw_position_errors(below, rows, 'm' if scene_map.manifest.frame.metric else 'map units')
+        draw_position_errors(below, rows, unit_of(scene_map))
         below.set_xlabel('time [s]', fontsize=LABEL_SIZE)
     else:
         draw_inliers(below, rows)
     return figure
-
-
-def png(figure: Figure) -> bytes:
-    """The picture as a PNG file."""
-    stream = BytesIO()
-    figure.savefig(stream, format='png', dpi=DPI, metadata={'Software': None})
-    return stream.getvalue()
 
 
 def _draw_errors(
@@ -303,10 +265,6 @@ def _finish(axes: Axes) -> None:
         axes.legend(fontsize=8, loc='upper right', ncols=4, framealpha=0.9)
 
 
-def _dots(axes: Axes, places: NDArray[np.float64], **style: Any) -> None:  # noqa: ANN401
-    axes.scatter(places[:, 0], places[:, 1], **{'linewidths': 0, **style})
-
-
 def _draw_ellipses(
     axes: Axes, centres: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> None:
@@ -320,26 +278,6 @@ def _draw_ellipses(
         ),
         autolim=False,
     )  # fmt: skip
-
-
-def _frame(axes: Axes, points: NDArray[np.float64], bodies: NDArray[np.float64]) -> None:
-    """Limits that hold all bodies and nearly all points: a few points lie far out."""
-    shown = bodies
-    if len(points):
-        shown = np.concatenate([bodies, np.quantile(points, [0.02, 0.98], axis=0)])
-    if len(shown):
-        low, high = shown.min(axis=0), shown.max(axis=0)
-        margin = 0.06 * max(float(np.max(high - low)), 1e-3)
-        axes.set_xlim(low[0] - margin, high[0] + margin)
-        axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set_aspect('equal', adjustable='box')
-    axes.grid(alpha=0.25, linewidth=0.6)
-    axes.tick_params(labelsize=8)
-
-
-def _thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Evenly picked points, so many as make sense in a picture."""
-    return points[:: max(1, -(-len(points) // MAX_POINTS_DRAWN))]
 
 
 def _seconds(chosen: Sequence[Row], rows: Sequence[Row]) -> NDArray[np.float64]:

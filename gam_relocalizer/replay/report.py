@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 from gam_relocalizer.geometry import write_text
 from gam_relocalizer.localization.result import Status
+from gam_relocalizer.plots import png, unit_of
 from gam_relocalizer.replay.figures import (
     drift_figure,
     error_figure,
     inlier_figure,
     match_figure,
     overview_figure,
-    png,
     timing_figure,
     trajectory_figure,
 )
@@ -137,11 +137,6 @@ def attempt_line(row: Row, scene_map: SceneMap) -> str:
     if error := row.error:
         parts.append(f'error {length_text(error.position, unit)} {error.rotation_deg:.2f}°')
     return '  '.join([*parts, f'{row.total_milliseconds:.0f} ms'])
-
-
-def unit_of(scene_map: SceneMap) -> str:
-    """Unit of a map's lengths."""
-    return 'm' if scene_map.manifest.frame.metric else 'map units'
 
 
 def headline_numbers(report: Report) -> dict[str, str]:

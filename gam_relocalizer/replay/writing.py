@@ -3,17 +3,19 @@
 """The files of a replay: trajectory, bag of fixes, summary, report.
 
 `poses.tum` has a line `timestamp tx ty tz qx qy qz qw` of map_from_base for every fix, `fixes.mcap`
-the same with covariances as the node publishes it, `corrected.tum` the odometry as corrected by the
-fixes, `summary.json` the numbers, `report.html` the pictures and all attempts, `overview.png` the
-run in one picture.
+the same with covariances as the node publishes it, `attempts.csv` the verdict on every image that
+was tried, `corrected.tum` the odometry as corrected by the fixes, `summary.json` the numbers,
+`report.html` the pictures and all attempts, `overview.png` the run in one picture.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from contextlib import contextmanager
 from dataclasses import asdict
+from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,6 +49,8 @@ if TYPE_CHECKING:
 POSES = 'poses.tum'
 CORRECTED = 'corrected.tum'
 FIXES = 'fixes.mcap'
+ATTEMPTS = 'attempts.csv'
+ATTEMPT_COLUMNS = ('stamp_ns', 'status', 'inliers', 'reason')
 SUMMARY = 'summary.json'
 FIX_TOPIC = '/relocalized_pose'
 
@@ -121,6 +125,15 @@ def write_corrected(folder: Path, trajectories: Trajectories) -> None:
     """Writes `corrected.tum`, in the format of `poses.tum`."""
     lines = (_tum_line(pose.stamp_ns, pose.map_from_base) for pose in trajectories.corrected)
     write_text(folder / CORRECTED, ''.join(lines))
+
+
+def write_attempts(folder: Path, rows: Sequence[Row]) -> None:
+    """Writes `attempts.csv`: the verdict on every image that was tried."""
+    stream = StringIO()
+    table = csv.writer(stream, lineterminator='\n')
+    table.writerow(ATTEMPT_COLUMNS)
+    table.writerows([row.stamp_ns, row.status.name, row.inliers, row.reason] for row in rows)
+    write_text(folder / ATTEMPTS, stream.getvalue())
 
 
 def write_fixes(folder: Path, rows: Sequence[Row], map_frame: str) -> None:

@@ -7,20 +7,28 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pycolmap
 import pytest
+import yaml
 
 from gam_relocalizer.geometry import rigid3d_from
-from gam_relocalizer.mapping.check import check_map
+from gam_relocalizer.mapping.check import NO_MODEL, NOT_LOCALIZED, check_map
 from gam_relocalizer.scene_map import (
+    MANIFEST,
+    SFM,
     ExtractorIdentity,
     Manifest,
     MapContent,
     MapFrame,
+    load_content,
     load_map,
+    save_frame,
     save_map,
+    sha256_of,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from conftest import BuiltMap
@@ -129,3 +137,176 @@ def test_an_empty_map_is_a_problem(tmp_path: Path) -> None:
     save_map(tmp_path / 'map', empty, MANIFEST_TO_BE, None)
 
     assert len(check_map(tmp_path / 'map').problems) == 1
+
+
+def saved_otherwise(
+    posed_map: BuiltMap, path: Path, change: Callable[[MapContent], MapContent]
+) -> Path:
+    """The map with other arrays beside the same COLMAP model, and sums that fit."""
+    manifest, content = load_content(posed_map.path)
+    save_map(path, change(content), manifest, pycolmap.Reconstruction(posed_map.path / SFM))
+    return path
+
+
+def with_a_point_moved(content: MapContent) -> MapContent:
+    points = content.points.copy()
+    points[17] += [0.0, 0.0, 1e-3]
+    return replace(content, points=points)
+
+
+def with_two_points_exchanged(content: MapContent) -> MapContent:
+    points = content.points.copy()
+    points[[3, 400]] = points[[400, 3]]
+    return replace(content, points=points)
+
+
+def with_an_image_moved(content: MapContent) -> MapContent:
+    poses = list(content.camera_from_sfm)
+    poses[5] = rigid3d_from([1, 0, 0, 0], [1e-3, 0, 0]) * poses[5]
+    return replace(content, camera_from_sfm=tuple(poses))
+
+
+def with_an_image_turned(content: MapContent) -> MapContent:
+    poses = list(content.camera_from_sfm)
+    turned = rigid3d_from([1, 0, 0, 1e-4], [0, 0, 0]) * poses[5]
+    poses[5] = turned
+    return replace(content, camera_from_sfm=tuple(poses))
+
+
+def with_an_observation_less(content: MapContent) -> MapContent:
+    offsets = content.observation_offsets.copy()
+    offsets[6:] -= 1
+    return replace(
+        content,
+        observation_offsets=offsets,
+        observation_points=np.delete(content.observation_points, content.observation_offsets[5]),
+    )
+
+
+def with_an_image_renamed(content: MapContent) -> MapContent:
+    names = list(content.image_names)
+    names[5] = 'another.png'
+    return replace(content, image_names=tuple(names))
+
+
+def test_a_bundle_written_again_is_consistent(posed_map: BuiltMap, tmp_path: Path) -> None:
+    assert check_map(saved_otherwise(posed_map, tmp_path / 'map', lambda same: same)).problems == ()
+
+
+@pytest.mark.parametrize('scale', [1e-3, 1.0, 250.0])
+def test_a_bundle_in_another_frame_is_consistent(
+    posed_map: BuiltMap, tmp_path: Path, scale: float
+) -> None:
+    path = saved_otherwise(posed_map, tmp_path / 'map', lambda same: same)
+    frame = MapFrame(scale, (0.8, 0.0, 0.6, 0.0), (4e6, -5e5, 30.0), metric=True, source='survey')
+    save_frame(path, frame, {'method': 'survey'})
+
+    assert check_map(path).problems == ()
+
+
+@pytest.mark.parametrize(
+    ('change', 'named'),
+    [
+        (with_a_point_moved, 'row 17'),
+        (with_two_points_exchanged, '2 of'),
+        (with_an_image_moved, 'view 05.png'),
+        (with_an_image_turned, 'view 05.png'),
+        (with_an_observation_less, 'view 05.png'),
+        (with_an_image_renamed, 'another.png'),
+    ],
+)
+def test_arrays_that_are_not_of_the_model_are_a_problem(
+    posed_map: BuiltMap,
+    tmp_path: Path,
+    change: Callable[[MapContent], MapContent],
+    named: str,
+) -> None:
+    path = saved_otherwise(posed_map, tmp_path / 'map', change)
+
+    (problem,) = check_map(path).problems
+
+    assert named in problem
+
+
+def test_a_wrong_covisibility_is_a_problem(posed_map: BuiltMap, tmp_path: Path) -> None:
+    path = saved_otherwise(posed_map, tmp_path / 'map', lambda same: same)
+    counts = np.load(path / 'covisibility_counts.npy')
+    counts[0] += 1
+    np.save(path / 'covisibility_counts.npy', counts)
+    manifest = yaml.safe_load((path / MANIFEST).read_text())
+    entry = manifest['files']['covisibility_counts.npy']
+    entry['sha256'] = sha256_of(path / 'covisibility_counts.npy')
+    (path / MANIFEST).write_text(yaml.safe_dump(manifest))
+
+    (problem,) = check_map(path).problems
+
+    assert 'covisibility' in problem
+
+
+def test_points_that_look_like_nothing_are_a_problem(posed_map: BuiltMap, tmp_path: Path) -> None:
+    def blank(content: MapContent) -> MapContent:
+        descriptors = np.array(content.descriptors)
+        descriptors[:5] = 0.0
+        return replace(content, descriptors=descriptors)
+
+    (problem,) = check_map(saved_otherwise(posed_map, tmp_path / 'map', blank)).problems
+
+    assert '5 of' in problem
+
+
+def test_points_that_nobody_sees_are_a_warning(tmp_path: Path) -> None:
+    save_map(tmp_path / 'map', content_seeing([range(150)] * 2), MANIFEST_TO_BE, None)
+
+    report = check_map(tmp_path / 'map')
+
+    assert report.problems == ()
+    assert any('50 of 200' in warning for warning in report.warnings)
+
+
+def test_a_map_that_lies_on_its_side_is_a_warning(posed_map: BuiltMap, tmp_path: Path) -> None:
+    path = saved_otherwise(posed_map, tmp_path / 'map', lambda same: same)
+    upright = check_map(path).warnings
+    save_frame(path, MapFrame(1.0, (0.8, 0.6, 0.0, 0.0), metric=True), {})
+
+    assert upright == ()
+    (warning,) = check_map(path).warnings
+    assert 'upright' in warning
+
+
+@pytest.mark.parametrize(
+    ('alignment', 'warnings'),
+    [
+        ({}, 0),
+        ({'method': 'distances', 'scale_sigma': 0.01, 'warnings': []}, 0),
+        ({'scale_sigma': 0.1}, 1),
+        ({'scale_sigma': 0.1, 'warnings': ['the cameras lie on a line']}, 2),
+        ({'scale_sigma': 'much', 'warnings': {'a': 1}}, 0),
+        ({'scale_sigma': float('nan'), 'warnings': [1, [2]]}, 0),
+    ],
+)
+def test_what_the_alignment_says_of_itself_is_passed_on(
+    posed_map: BuiltMap, tmp_path: Path, alignment: dict[str, object], warnings: int
+) -> None:
+    path = saved_otherwise(posed_map, tmp_path / 'map', lambda same: same)
+    save_frame(path, MapFrame(metric=True), alignment)
+
+    assert len(check_map(path).warnings) == warnings
+
+
+def test_says_what_was_not_checked(posed_map: BuiltMap, tmp_path: Path) -> None:
+    manifest, content = load_content(posed_map.path)
+    save_map(tmp_path / 'bare', content, manifest, None)
+
+    assert check_map(posed_map.path).not_checked == (NOT_LOCALIZED,)
+    assert check_map(tmp_path / 'bare').not_checked == (NOT_LOCALIZED, NO_MODEL)
+
+
+def test_bytes_per_point_are_those_of_the_files(posed_map: BuiltMap) -> None:
+    per_point = check_map(posed_map.path).bytes_per_point
+
+    points = load_map(posed_map.path).num_points
+    files = [file for file in posed_map.path.rglob('*') if file.is_file()]
+    size = sum(file.stat().st_size for file in files if file.name != MANIFEST)
+    model = sum(file.stat().st_size for file in (posed_map.path / SFM).iterdir())
+    assert per_point['sfm'] == pytest.approx(model / points)
+    assert per_point['run time'] == pytest.approx((size - model) / points)

@@ -15,6 +15,7 @@ from corner_room import CAMERA
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from map_content import all_global_descriptors
 
 from gam_relocalizer.errors import ImageError, MapError, UsageError
 from gam_relocalizer.geometry import rigid3d_from
@@ -31,9 +32,11 @@ from gam_relocalizer.scene_map import (
     SFM,
     ExtractorIdentity,
     Manifest,
+    MapContent,
     MapFrame,
     SceneMap,
     load_map,
+    map_in_memory,
 )
 
 if TYPE_CHECKING:
@@ -64,17 +67,19 @@ def references_of(sees: np.ndarray, seed: int = 0) -> ReferenceImages:
             point_of_keypoint != NO_POINT
         ]
     seen = [np.flatnonzero(row) for row in sees]
-    scene_map = SceneMap(
-        path=Path('map'),
-        manifest=MANIFEST,
-        image_names=tuple(map(str, range(num_images))),
-        camera_from_map=(rigid3d_from([1, 0, 0, 0], [0, 0, 0]),) * num_images,
-        points=rng.normal(size=(num_points, 3)),
-        descriptors=np.zeros((num_points, DIMENSION), np.float16),
-        observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
-        observation_points=np.concatenate(seen).astype(np.int32),
-        global_descriptors=rng.normal(size=(num_images, 3)).astype(np.float32),
-        codebook=np.zeros((1, DIMENSION), np.float32),
+    scene_map = map_in_memory(
+        Path('map'),
+        MapContent(
+            image_names=tuple(map(str, range(num_images))),
+            camera_from_sfm=(rigid3d_from([1, 0, 0, 0], [0, 0, 0]),) * num_images,
+            points=rng.normal(size=(num_points, 3)),
+            descriptors=np.zeros((num_points, DIMENSION), np.float16),
+            observation_offsets=np.cumsum([0, *map(len, seen)], dtype=np.int64),
+            observation_points=np.concatenate(seen).astype(np.int32),
+            global_descriptors=rng.normal(size=(num_images, 3)).astype(np.float32),
+            codebook=np.zeros((1, DIMENSION), np.float32),
+        ),
+        MANIFEST,
     )
     return ReferenceImages(scene_map, tuple(images), sums)
 
@@ -139,7 +144,8 @@ def test_descriptors_are_the_means_over_the_other_images(sees: np.ndarray, seed:
 @given(visibilities, st.integers(0, 1000))
 def test_reference_is_the_most_alike_of_the_others(sees: np.ndarray, seed: int) -> None:
     references = references_of(sees, seed)
-    alike = references.scene_map.global_descriptors @ references.scene_map.global_descriptors.T
+    described = all_global_descriptors(references.scene_map)
+    alike = described @ described.T
     np.fill_diagonal(alike, -np.inf)
 
     for image in range(len(sees)):
@@ -164,7 +170,8 @@ def references(posed_map: BuiltMap, room: Room) -> ReferenceImages:
 def test_sums_of_the_tracks_are_the_map_s_descriptors(references: ReferenceImages) -> None:
     sums = references.descriptor_sums
     means = sums / np.linalg.norm(sums, axis=1, keepdims=True)
-    np.testing.assert_allclose(means, references.scene_map.descriptors, atol=1e-3)
+    everything = np.arange(len(means))
+    np.testing.assert_allclose(means, references.scene_map.descriptors_of(everything), atol=1e-3)
 
 
 def test_keypoints_lie_where_their_points_are_seen(references: ReferenceImages) -> None:
@@ -235,7 +242,8 @@ def without_build_options(scene_map: SceneMap) -> SceneMap:
 
 
 def with_a_point_less(scene_map: SceneMap) -> SceneMap:
-    return replace(scene_map, points=scene_map.points[:-1])
+    stored = replace(scene_map.stored, points=scene_map.stored.points[:-1])
+    return replace(scene_map, stored=stored)
 
 
 def with_an_image_renamed(scene_map: SceneMap) -> SceneMap:

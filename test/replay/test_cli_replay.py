@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from gam_relocalizer.cli.replay import replay
 from gam_relocalizer.errors import BagError, MapError, UsageError, WeightsError
 from gam_relocalizer.localization.localizer import Localizer
-from gam_relocalizer.replay.writing import CORRECTED, FIXES, POSES, SUMMARY
+from gam_relocalizer.replay.writing import ATTEMPTS, CORRECTED, FIXES, POSES, SUMMARY
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,7 +49,7 @@ def test_writes_all_files_and_succeeds_with_refused_attempts(
         '--truth-topic', '/ground_truth',
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    names = {POSES, FIXES, SUMMARY, 'report.html', 'overview.png'}
+    names = {POSES, ATTEMPTS, FIXES, SUMMARY, 'report.html', 'overview.png'}
     assert {file.name for file in out.iterdir()} == names
     summary = json.loads((out / SUMMARY).read_text(encoding='utf-8'))
     assert summary['trajectory_errors'] == {}

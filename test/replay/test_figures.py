@@ -10,11 +10,13 @@ import pycolmap
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from map_content import with_points
 from recorded_drive import camera_from_map_at
 from scipy.spatial.transform import Rotation
 
 from gam_relocalizer.geometry import rigid3d_from_rotation
-from gam_relocalizer.replay.figures import View, png, trajectory_figure
+from gam_relocalizer.plots import View, png
+from gam_relocalizer.replay.figures import trajectory_figure
 
 if TYPE_CHECKING:
     from gam_relocalizer.scene_map import SceneMap
@@ -23,13 +25,8 @@ if TYPE_CHECKING:
 def turned(scene_map: SceneMap, turn: Rotation) -> SceneMap:
     """The same place in a map frame that is turned."""
     other_from_map = rigid3d_from_rotation(turn, np.zeros(3))
-    return replace(
-        scene_map,
-        camera_from_map=tuple(
-            pose * other_from_map.inverse() for pose in scene_map.camera_from_map
-        ),
-        points=turn.apply(scene_map.points),
-    )
+    poses = tuple(pose * other_from_map.inverse() for pose in scene_map.camera_from_map)
+    return with_points(replace(scene_map, camera_from_map=poses), turn.apply(scene_map.points))
 
 
 def test_upright_map_is_seen_along_its_own_axes(wall_map: SceneMap) -> None:
@@ -58,7 +55,7 @@ def test_map_without_images_is_seen_along_its_own_axes(wall_map: SceneMap) -> No
 
 def test_one_far_point_does_not_shrink_the_picture(wall_map: SceneMap) -> None:
     far = np.concatenate([wall_map.points, [[1e6, 1e6, 0.0]]])
-    axes = trajectory_figure([], replace(wall_map, points=far)).axes[0]
+    axes = trajectory_figure([], with_points(wall_map, far)).axes[0]
     assert max(map(abs, axes.get_xlim())) < 10.0
 
 
@@ -75,4 +72,4 @@ def test_camera_that_knows_no_direction_up_is_no_failure(wall_map: SceneMap) -> 
 @pytest.mark.parametrize('count', [0, 1, 200_000])
 def test_any_number_of_points_makes_a_picture(wall_map: SceneMap, count: int) -> None:
     points = np.random.default_rng(0).normal(size=(count, 3))
-    assert png(trajectory_figure([], replace(wall_map, points=points))).startswith(b'\x89PNG')
+    assert png(trajectory_figure([], with_points(wall_map, points))).startswith(b'\x89PNG')

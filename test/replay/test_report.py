@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import base64
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pytest
+from map_content import changed_map, of_first_images, with_points
 from recorded_drive import KnowingLocalizer, map_from_base_at, stamp_of
 
 from gam_relocalizer.localization.result import Status
-from gam_relocalizer.replay.figures import error_figure, png
+from gam_relocalizer.plots import png
+from gam_relocalizer.replay.figures import error_figure
 from gam_relocalizer.replay.replay import ReplayOptions, replay_bag
 from gam_relocalizer.replay.report import OVERVIEW, REPORT, Report, report_html, write_report
 from gam_relocalizer.replay.summary import Row, row_of
@@ -143,12 +146,10 @@ def test_report_of_a_map_that_is_empty_and_not_metric_is_whole(
     report: Report, tmp_path: Path
 ) -> None:
     frame = replace(report.scene_map.manifest.frame, metric=False)
-    empty = replace(
-        report.scene_map,
-        manifest=replace(report.scene_map.manifest, frame=frame),
-        image_names=(),
-        camera_from_map=(),
-        points=np.zeros((0, 3)),
+    without_points = with_points(
+        replace(report.scene_map, manifest=replace(report.scene_map.manifest, frame=frame)),
+        np.zeros((0, 3)),
     )
+    empty = changed_map(without_points, partial(of_first_images, count=0))
     write_report(tmp_path, replace(report, scene_map=empty, illustrations=()))
     assert 'map units' in (tmp_path / REPORT).read_text(encoding='utf-8')
