@@ -4,12 +4,15 @@
 
 Maps are taken as they are and written again with descriptors of 16 and of 8 bits. Queries of a map
 come from the set of images that its name begins with (see `real_data.py`), of the demo's map from
-its bag. A made-up drive of any length tells how load time and memory grow with a map: two laps of a
-street, all queries of a map in a process of its own, with networks, options and code of the real
-ones. Its files have just been written, so that loading does not wait for the disk.
+its bag. Recall is that of all poses found, and of those that were accepted (fixes), but for the
+check whether an image is mirrored, which no width of the map changes.
+
+A made-up drive of any length tells how load time and memory grow with a map: two laps of a street,
+all queries of a map in a process of its own, with networks, options and code of the real ones. Its
+files have just been written, so that loading does not wait for the disk.
 
     python benchmarks/map_size.py sizes maps/demo build/benchmarks/*-images
-    python benchmarks/map_size.py recall DATA build/benchmarks/* --demo-bag build/demo/query_bag
+    python benchmarks/map_size.py recall DATA maps/demo build/benchmarks/*
     python benchmarks/map_size.py growth --points 100000 1000000
 """
 
@@ -31,19 +34,20 @@ import pycolmap
 from process_usage import resources
 
 from gam_relocalizer.demo.shipped import demo_map_path
+from gam_relocalizer.demo.trajectories import BASE_FROM_CAMERA
 from gam_relocalizer.evaluation.localization import read_query_set
-from gam_relocalizer.evaluation.metrics import THRESHOLDS, accuracy
+from gam_relocalizer.evaluation.metrics import THRESHOLDS, Threshold, accuracy
 from gam_relocalizer.features.local import LocalFeatures
 from gam_relocalizer.features.registry import create_extractor
-from gam_relocalizer.features.vlad import RETRIEVAL_NAME
+from gam_relocalizer.features.vlad import RETRIEVAL_NAME, Vlad
 from gam_relocalizer.geometry import pose_error
 from gam_relocalizer.images import read_image
 from gam_relocalizer.localization.continuity import ContinuityOptions
-from gam_relocalizer.localization.localizer import Localizer
+from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
+from gam_relocalizer.localization.pose import PoseOptions
 from gam_relocalizer.map_encoding import unit_rows
 from gam_relocalizer.matching.registry import DEFAULT_MATCHER, create_matcher
 from gam_relocalizer.replay.replay import ReplayOptions, replay_bag
-from gam_relocalizer.replay.summary import row_of
 from gam_relocalizer.scene_map import (
     DESCRIPTOR_BITS,
     IMAGES,
@@ -62,8 +66,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
+    from pycolmap import Rigid3d, Sim3d
 
     from gam_relocalizer.geometry import PoseError
+    from gam_relocalizer.localization.prior import Prior
+    from gam_relocalizer.localization.result import LocalizationResult
 
 # Groups of files by how their names begin; what is left is the last.
 PARTS = {
@@ -75,6 +82,8 @@ PARTS = {
     'the rest': ('codebook', IMAGES, MANIFEST),
 }
 EXTRACTOR = 'xfeat'
+DEMO_BAG = Path('build/demo/query_bag')
+SAMPLINGS = 3
 
 # The street is full of things; cameras look along it, and go along it twice [m].
 SPACING = 0.5
@@ -122,7 +131,9 @@ def main() -> None:
     recall = commands.add_parser('recall', help='what 8 bits lose')
     recall.add_argument('data', type=Path, help='folder of the image sets')
     recall.add_argument('maps', type=Path, nargs='+')
-    recall.add_argument('--demo-bag', type=Path, help='queries of the map of the demo')
+    recall.add_argument(
+        '--demo-bag', type=Path, default=DEMO_BAG, help='queries of the map of the demo'
+    )
     growth = commands.add_parser('growth', help='load time and memory of a large map')
     growth.add_argument('--points', type=int, nargs='+', default=[100_000, 1_000_000])
     use = commands.add_parser('use', help='(what `growth` calls in a process of its own)')
@@ -178,69 +189,159 @@ def _written_with(bits: int, path: Path, folder: Path) -> Path:
     return written
 
 
-def _recall_table(data: Path, maps: Sequence[Path], demo_bag: Path | None) -> str:
-    """A row for each map and width, and one for all queries together."""
-    header = ['map', 'bits', 'queries', 'fixes', 'median error', *map(_in_words, THRESHOLDS[:3])]
+def _recall_table(data: Path, maps: Sequence[Path], demo_bag: Path) -> str:
+    """Two rows for each map, one for each width, and for all queries, with what 8 bits lose."""
+    limits = [_in_words(threshold) for threshold in THRESHOLDS[:3]]
+    fixes = [f'fixes {limit}' for limit in limits]
+    header = ['map', 'bits', 'attempts', 'median error', *limits, 'fixes', *fixes]
     rows = []
-    errors: dict[int, list[PoseError]] = {bits: [] for bits in DESCRIPTOR_BITS}
-    total = 0
-    with tempfile.TemporaryDirectory() as folder:
-        for path in maps:
-            for bits in DESCRIPTOR_BITS:
-                written = _written_with(bits, path, Path(folder))
-                if path.resolve() == demo_map_path().resolve():
-                    if demo_bag is None:
-                        continue
-                    found, queries = _errors_in_bag(written, demo_bag)
-                else:
-                    found, queries = _errors_in_set(written, data / path.name.rpartition('-')[0])
-                rows.append([path.name, str(bits), *_recall_cells(found, queries)])
-                print(' '.join(rows[-1]), file=sys.stderr, flush=True)
-                errors[bits] += found
-            total += queries
-    for bits, all_found in errors.items():
-        rows.append(['all', str(bits), *_recall_cells(all_found, total)])
+    everything = {bits: _Answers() for bits in DESCRIPTOR_BITS}
+    for path in maps:
+        with tempfile.TemporaryDirectory() as folder:
+            localizers = _Localizers(path, Path(folder))
+            if path.resolve() == demo_map_path().resolve():
+                answers = _answers_to_bag(localizers, demo_bag)
+            else:
+                answers = _answers_to_set(localizers, data / path.name.rpartition('-')[0])
+        for bits, of_width in answers.items():
+            rows.append([path.name, f'{bits}', *of_width.cells()])
+            print(' '.join(rows[-1]), file=sys.stderr, flush=True)
+            everything[bits].add(of_width)
+    rows += [['all', f'{bits}', *answers.cells()] for bits, answers in everything.items()]
+    full, small = (everything[bits].shares() for bits in (16, 8))
+    lost = [f'{100 * (more - less):.2f}' for more, less in zip(full, small, strict=True)]
+    rows.append(['points lost', '8', '', '', *lost])
     return _table(header, rows)
 
 
-def _errors_in_set(map_path: Path, folder: Path) -> tuple[list[PoseError], int]:
-    """Errors of the fixes, and the number of queries."""
+class _Answers:
+    """What became of queries."""
+
+    def __init__(self) -> None:
+        self.attempts = 0
+        self.found: list[PoseError] = []
+        self.fixes: list[PoseError] = []
+
+    def take(self, result: LocalizationResult, world_from_map: Sim3d, truth: Rigid3d) -> None:
+        """Adds the best pose of an attempt, which is a fix when it was accepted."""
+        self.attempts += 1
+        if result.estimate is not None:
+            found = world_from_map.transform_camera_world(result.estimate.camera_from_map)
+            self.found.append(pose_error(found, truth))
+            self.fixes += self.found[-1:] if result.accepted else []
+
+    def add(self, others: _Answers) -> None:
+        """Takes in all others."""
+        self.attempts += others.attempts
+        self.found += others.found
+        self.fixes += others.fixes
+
+    def shares(self) -> list[float]:
+        """Shares of the attempts: poses within each threshold, fixes, and these within each."""
+        found, fixes = (accuracy(errors, self.attempts) for errors in (self.found, self.fixes))
+        thresholds = THRESHOLDS[:3]
+        return [
+            *(found.recall[threshold] for threshold in thresholds),
+            fixes.localized / self.attempts,
+            *(fixes.recall[threshold] for threshold in thresholds),
+        ]
+
+    def cells(self) -> list[str]:
+        """Of a row."""
+        found = accuracy(self.found, self.attempts)
+        return [
+            f'{self.attempts}',
+            f'{100 * found.median_position:.2f} cm, {found.median_rotation_deg:.3f} deg',
+            *(f'{100 * share:.1f} %' for share in self.shares()),
+        ]
+
+
+class _Localizers:
+    """One map in all widths, each with several samplings: an image is described once for all.
+
+    Which poses are drawn decides whether an attempt at the edge of a threshold is a fix, and a
+    change in the last bit draws others. More than one sampling tells that from a loss.
+    """
+
+    def __init__(self, path: Path, folder: Path) -> None:
+        scene_map = load_map(path)
+        self.path = path
+        self._extractor = create_extractor(scene_map.manifest.extractor.name)
+        self._vlad = Vlad(scene_map.codebook)
+        matcher = create_matcher(DEFAULT_MATCHER, extractor=scene_map.manifest.extractor.name)
+        maps = {bits: load_map(_written_with(bits, path, folder)) for bits in DESCRIPTOR_BITS}
+        self._localizers = [
+            (bits, Localizer(maps[bits], self._extractor, matcher, _sampled(seed)))
+            for bits in DESCRIPTOR_BITS
+            for seed in range(SAMPLINGS)
+        ]
+
+    def attempts(
+        self, image: NDArray[np.uint8], camera: pycolmap.Camera
+    ) -> list[tuple[int, LocalizationResult]]:
+        """Widths and what they made of an image."""
+        features = self._extractor.extract(image)
+        described = self._vlad.describe(image, features)
+        return [
+            (bits, localizer.localize_features(features, described, camera))
+            for bits, localizer in self._localizers
+        ]
+
+
+def _sampled(seed: int) -> LocalizerOptions:
+    return LocalizerOptions(pose=PoseOptions(seed=seed))
+
+
+def _answers_to_set(localizers: _Localizers, folder: Path) -> dict[int, _Answers]:
     query_set = read_query_set(
-        map_path,
+        localizers.path,
         folder / 'query',
         folder / 'poses_query.txt',
         reference=folder / 'poses_mapping.txt',
     )
-    localizer, errors = Localizer.load(map_path), []
+    answers = {bits: _Answers() for bits in DESCRIPTOR_BITS}
     for name, truth in query_set.truth.items():
-        result = localizer.localize(read_image(folder / 'query' / name), query_set.camera)
-        if result.accepted and result.estimate is not None:
-            camera_from_map = result.estimate.camera_from_map
-            found = query_set.world_from_map.transform_camera_world(camera_from_map)
-            errors.append(pose_error(found, truth))
-    return errors, len(query_set.truth)
+        image = read_image(folder / 'query' / name)
+        for bits, result in localizers.attempts(image, query_set.camera):
+            answers[bits].take(result, query_set.world_from_map, truth)
+    return answers
 
 
-def _errors_in_bag(map_path: Path, bag: Path) -> tuple[list[PoseError], int]:
+def _answers_to_bag(localizers: _Localizers, bag: Path) -> dict[int, _Answers]:
     """The same for every image of the demo's bag, each by itself."""
+    listening = _Listening(localizers)
     options = ReplayOptions(
         period=0.0, truth_topic='/ground_truth', continuity=ContinuityOptions(metric=False)
     )
-    rows = [row_of(one) for one in replay_bag(bag, Localizer.load(map_path), options).attempts]
-    return [row.error for row in rows if row.error is not None], len(rows)
+    replayed = replay_bag(bag, listening, options)
+    answers = {bits: _Answers() for bits in DESCRIPTOR_BITS}
+    for attempt, results in zip(replayed.attempts, listening.heard, strict=True):
+        if attempt.truth is not None:
+            truth = (attempt.truth * BASE_FROM_CAMERA).inverse()
+            for bits, result in results:
+                answers[bits].take(result, pycolmap.Sim3d(), truth)
+    return answers
 
 
-def _recall_cells(errors: Sequence[PoseError], queries: int) -> list[str]:
-    found = accuracy(errors, queries)
-    return [
-        str(queries),
-        str(found.localized),
-        f'{100 * found.median_position:.2f} cm, {found.median_rotation_deg:.3f} deg',
-        *(f'{100 * found.recall[threshold]:.1f} %' for threshold in THRESHOLDS[:3]),
-    ]
+class _Listening:
+    """Lets a replay ask all localizers."""
+
+    def __init__(self, localizers: _Localizers) -> None:
+        self._localizers = localizers
+        self.heard: list[list[tuple[int, LocalizationResult]]] = []
+
+    def localize(
+        self,
+        image: NDArray[np.uint8],
+        camera: pycolmap.Camera,
+        prior: Prior | None = None,  # noqa: ARG002 - each image by itself
+    ) -> LocalizationResult:
+        """See `Localizer`."""
+        self.heard.append(self._localizers.attempts(image, camera))
+        return self.heard[-1][0][1]
 
 
-def _in_words(threshold: object) -> str:
+def _in_words(threshold: Threshold) -> str:
     return f'{100 * threshold.position:.0f} cm, {threshold.rotation_deg:.0f} deg'
 
 
