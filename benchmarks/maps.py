@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 # The calibration that comes with these is nominal; structure from motion refines it.
 NOMINAL_CAMERAS = frozenset({'redkitchen'})
+# Poses of the camera itself, which no topic's type tells.
+WHEREABOUTS = {'redkitchen-query_bag': ('--odom-topic', '/ground_truth/pose', '--base-frame', '')}
 COLUMNS = (
     'source',
     'images',
@@ -84,7 +86,7 @@ def _sources(data: Path) -> list[Source]:
     bags = sorted(file.parent for file in data.glob('*/*/metadata.yaml'))
     return [
         *(_image_set(folder) for folder in sets),
-        *(Source(f'{bag.parent.name}-{bag.name}', ('--bag', str(bag))) for bag in bags),
+        *(_bag(folder) for folder in bags),
         *(Source(video.stem, ('--video', str(video))) for video in sorted(data.glob('**/*.mp4'))),
     ]
 
@@ -94,6 +96,11 @@ def _image_set(folder: Path) -> Source:
     images = folder / 'mapping'
     options = ('--images', str(images), '--camera', str(folder / 'camera.txt'), *refined)
     return Source(folder.name, options, images, folder / 'poses_mapping.txt')
+
+
+def _bag(folder: Path) -> Source:
+    name = f'{folder.parent.name}-{folder.name}'
+    return Source(name, ('--bag', str(folder), *WHEREABOUTS.get(name, ())))
 
 
 def _row(source: Source, path: Path) -> list[str]:
