@@ -29,6 +29,7 @@ class ImageSet:
         camera_from_world: By name of image; None when no poses are known. Images without a pose
             are left out of a map that is built with poses.
         metric: Whether one unit of the poses is a metre.
+        source: Name of what they come from, for people; that of the folder when it is empty.
     """
 
     folder: Path
@@ -36,6 +37,11 @@ class ImageSet:
     cameras: Mapping[str, pycolmap.Camera] = field(default_factory=dict)
     camera_from_world: Mapping[str, pycolmap.Rigid3d] | None = None
     metric: bool = True
+    source: str = ''
+
+    def __post_init__(self) -> None:
+        if not self.source:
+            object.__setattr__(self, 'source', self.folder.absolute().name)
 
     @classmethod
     def of_folder(

@@ -29,9 +29,11 @@ and indices are checked, before anything is used.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import math
 import mmap
+import os
 import shutil
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -401,6 +403,7 @@ def save_map(
     Raises:
         MapError: `path` exists and is not a map bundle.
         UsageError: Descriptors cannot be stored in so many bits.
+        OSError: The disk is full, or the folder cannot be written to.
     """
     if path.exists() and not (path / MANIFEST).is_file():
         msg = f'{path}: exists and is not a map bundle (no {MANIFEST}); choose another name'
@@ -511,6 +514,19 @@ def read_manifest(path: Path) -> Manifest:
         raise MapError(msg) from err
 
 
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Writes COLMAP's binary files; unlike COLMAP itself, it notices when the disk is full.
+
+    Raises:
+        OSError: The disk is full.
+    """
+    model.write_binary(folder)
+    last = folder / 'points3D.bin'
+    expected = 8 + 51 * model.num_points3D() + 8 * model.compute_num_observations()
+    if last.stat().st_size != expected:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(last))
+
+
 def verify_files(path: Path, manifest: Manifest, names: Iterator[str]) -> None:
     """Compares size and sha256 of the named files with the manifest.
 
@@ -539,7 +555,7 @@ def _write_bundle(
 ) -> Manifest:
     if sfm is not None:
         (folder / SFM).mkdir()
-        sfm.write_binary(folder / SFM)
+        write_model(sfm, folder / SFM)
     poses = dict(zip(content.image_names, content.camera_from_sfm, strict=True))
     write_poses(folder / IMAGES, poses)
     stored, manifest = _stored(content, manifest)

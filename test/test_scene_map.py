@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 import yaml
+from full_disk import files_no_larger_than
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from map_content import all_global_descriptors
@@ -346,6 +347,20 @@ def test_a_failed_save_leaves_the_older_map_and_nothing_else(bundle: Path) -> No
 
     with pytest.raises(ValueError, match='zip'):
         save_map(bundle, unequal, MANIFEST_TO_BE, None)
+    assert load_map(bundle).num_images == 5
+    assert [folder.name for folder in bundle.parent.iterdir()] == ['map']
+
+
+def test_a_disk_that_is_full_before_the_model_is_written_leaves_the_older_map(bundle: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 5
+    options.num_points3D = 3000
+    model = pycolmap.synthesize_dataset(options)
+
+    # the arrays have room, and the model has not
+    with files_no_larger_than(100_000), pytest.raises(OSError, match='No space left'):
+        save_map(bundle, random_content(seed=1), MANIFEST_TO_BE, model)
+    assert not (bundle / 'sfm').exists()
     assert load_map(bundle).num_images == 5
     assert [folder.name for folder in bundle.parent.iterdir()] == ['map']
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from gam_relocalizer.alignment.constraints import Triple
 
 MAX_BYTES = 64 * 2**20
+# A typing error, and not what a tape measure shows.
+MIN_METRES, MAX_METRES = 1e-6, 1e9
 
 
 def read_positions(path: Path) -> dict[str, Triple]:
@@ -61,7 +63,7 @@ def read_distances(path: Path) -> list[Distance]:
     """Reads lines `A B metres`; A and B are `name` or `name@column,row`.
 
     Raises:
-        UsageError: Missing file, malformed line, or a distance that is not positive.
+        UsageError: Missing file, malformed line, or a distance that nothing has.
     """
     expected = 'A B metres'
     distances = []
@@ -74,8 +76,11 @@ def read_distances(path: Path) -> list[Distance]:
         if len(words) != 3:
             raise _malformed(where, f'{expected}` (names with spaces in quotes', line)
         (metres,) = _numbers(words[2:], where)
-        if metres <= 0.0:
-            msg = f'{where}: a distance of {metres:g} m; it has to be positive'
+        if not MIN_METRES <= metres <= MAX_METRES:
+            msg = (
+                f'{where}: a distance of {metres:g} m; expected metres, from {MIN_METRES:g} to '
+                f'{MAX_METRES:g}'
+            )
             raise UsageError(msg)
         first, second = (_place(word, where) for word in words[:2])
         if first == second:

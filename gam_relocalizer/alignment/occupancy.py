@@ -91,7 +91,7 @@ def _fields(data: Any, path: Path) -> tuple[Path, float, tuple[float, float, flo
     except (KeyError, TypeError, ValueError) as err:
         msg = (
             f'{path}: expected `image: FILE`, `resolution: METRES` and `origin: [x, y, yaw]`, as '
-            f'map_server has them: {err!r}'
+            f'map_server has them'
         )
         raise UsageError(msg) from err
     if not all(math.isfinite(value) for value in (resolution, x, y, yaw)) or resolution <= 0.0:

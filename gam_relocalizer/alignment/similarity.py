@@ -42,6 +42,8 @@ _NEVER_GROSS = 0.005
 _LEAST_ANGLE = math.radians(0.2)
 # In place of the errors of exact input, which nothing can be divided by.
 _TINY = 1e-9
+# Further off, squares of squares of places leave the range of numbers; no place is.
+_FARTHEST = 1e12
 # Places this close to a line, seen from its length, leave the rotation about it open.
 _LINE = 1e-4
 _MAX_ROTATION_SIGMA_DEG = 3.0
@@ -374,6 +376,9 @@ def _check_spread(source: NDArray[np.float64], target: NDArray[np.float64]) -> N
             f'least; with fewer, level the map (--level) and give a distance (--distances)'
         )
         raise AlignmentError(msg)
+    if not (farthest := float(np.abs(target).max())) <= _FARTHEST:
+        msg = f'a given place is {farthest:g} m from the origin; check the numbers and their unit'
+        raise AlignmentError(msg)
     spread = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)[0]
     own_spread = np.linalg.svd(source - source.mean(axis=0), compute_uv=False)[0]
     if spread <= _TINY * max(1.0, np.abs(target).max()):
@@ -455,7 +460,8 @@ def _compare_handedness(
         msg = (
             f'the positions look mirrored: they fit {gain:.0f} times '
             f'better with one axis turned over. Give them in a right-handed frame (swap '
-            f'two axes or negate one; rows of an image count downwards, y goes up)'
+            f'two axes or negate one; rows of an image count downwards, y goes up), and '
+            f'with z up (NED is x north, y east, z down: give y, x, -z)'
         )
         raise AlignmentError(msg)
 

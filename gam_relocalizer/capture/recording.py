@@ -45,14 +45,14 @@ class BagOptions:
         camera_info_topic: Needed only when it is not beside the image topic.
         camera: The camera; without it the bag's CameraInfo tells.
         image_is_rectified: The images are rectified: use P of the CameraInfo, no distortion.
-        whereabouts: What tells where the images were taken.
+        whereabouts: What tells where the images were taken; None when nobody wants to know.
     """
 
     image_topic: str | None = None
     camera_info_topic: str | None = None
     camera: pycolmap.Camera | None = None
     image_is_rectified: bool = False
-    whereabouts: WhereaboutsTopics = field(default_factory=WhereaboutsTopics)
+    whereabouts: WhereaboutsTopics | None = field(default_factory=WhereaboutsTopics)
 
 
 def capture_bag(
@@ -78,13 +78,15 @@ def capture_bag(
     with open_bag(path) as bag:
         topic = find_image_topic(bag, options.image_topic)
         info = _camera_info_topic(bag, topic, options)
-        whereabouts = options.whereabouts.found_in(bag)
+        whereabouts = options.whereabouts and options.whereabouts.found_in(bag)
         selection = keep_keyframes(_BagFrames(bag, topic, progress), workspace)
         cameras, camera_warnings = _cameras(bag, info, selection, options)
-        references, warnings = read_whereabouts(bag, selection.keyframes, whereabouts)
+        references, warnings = (
+            read_whereabouts(bag, selection.keyframes, whereabouts) if whereabouts else ((), ())
+        )
     return Capture(
         name=str(path),
-        images=ImageSet(selection.folder, selection.names, cameras),
+        images=ImageSet(selection.folder, selection.names, cameras, source=path.absolute().name),
         counts=selection.counts,
         references=references,
         warnings=(*selection.warnings, *camera_warnings, *warnings),

@@ -57,7 +57,7 @@ def capture_video(
     if camera is not None:
         _check_size(selection, camera, path)
     cameras = {} if camera is None else dict.fromkeys(selection.names, camera)
-    images = ImageSet(selection.folder, selection.names, cameras)
+    images = ImageSet(selection.folder, selection.names, cameras, source=path.absolute().name)
     return Capture(str(path), images, selection.counts, warnings=selection.warnings)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import os
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,7 @@ from gam_relocalizer.mapping.extraction import Extraction
 from gam_relocalizer.mapping.intrinsics import assign_cameras
 from gam_relocalizer.mapping.pairs import choose_pairs
 from gam_relocalizer.mapping.progress import ignore_progress
-from gam_relocalizer.mapping.report import BuildReport
+from gam_relocalizer.mapping.report import BuildReport, calibration_warnings
 from gam_relocalizer.mapping.sfm import MIN_IMAGES, SfmInput, image_id_of, quiet_colmap
 from gam_relocalizer.mapping.steps import Matched, Steps
 from gam_relocalizer.mapping.workspace import temporary_workspace
@@ -139,11 +139,14 @@ def build_map(
         model = steps.reconstruct(matched, sfm_input, options.mapper)
         with steps.timer.step('describe'):
             content = _content(model.reconstruction, extracted.images, retrieval)
-        report = _report(images.names, wanted, extracted, matched, model, content, steps)
+        report = replace(
+            _report(images.names, wanted, extracted, matched, model, content, steps),
+            warnings=calibration_warnings(cameras, dict(model.reconstruction.cameras.items())),
+        )
         progress('save', 0, 1)
         identity = describer or Vlad(retrieval.codebook)
         manifest = _manifest(images, frame, extractor, identity, options, report)
-        _save(out, content, manifest, model.reconstruction)
+        save_bundle(out, content, manifest, model.reconstruction)
         steps.forget_others()
     progress('save', 1, 1)
     return report
@@ -153,9 +156,18 @@ def _check_options(options: MapBuildOptions) -> None:
     if options.mapper not in MAPPERS:
         msg = f'unknown mapper `{options.mapper}`; known are {", ".join(MAPPERS)}'
         raise UsageError(msg)
-    if options.descriptor_bits not in DESCRIPTOR_BITS:
+    check_descriptor_bits(options.descriptor_bits)
+
+
+def check_descriptor_bits(bits: int) -> None:
+    """Refuses a number of bits that a map cannot keep of a number of its descriptors.
+
+    Raises:
+        UsageError: See above.
+    """
+    if bits not in DESCRIPTOR_BITS:
         known = ' or '.join(map(str, DESCRIPTOR_BITS))
-        msg = f'descriptors of {options.descriptor_bits} bits: must be {known}'
+        msg = f'descriptors of {bits} bits: must be {known}'
         raise UsageError(msg)
 
 
@@ -278,9 +290,14 @@ def _report(
     )
 
 
-def _save(
+def save_bundle(
     out: Path, content: MapContent, manifest: Manifest, model: pycolmap.Reconstruction
 ) -> None:
+    """Writes a map whose making took long.
+
+    Raises:
+        MapError: The disk is full, or the folder cannot be written to.
+    """
     try:
         save_map(out, content, manifest, model)
     except OSError as err:
@@ -304,7 +321,7 @@ def _manifest(
         frame=frame,
         counts={},
         build={
-            'images': images.folder.absolute().name,
+            'images': images.source,
             'options': {
                 'cameras': sorted({format_camera(one) for one in images.cameras.values()}),
                 'poses': None

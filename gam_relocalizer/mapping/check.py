@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +14,11 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.mapping.consistency import has_model, inconsistencies
 from gam_relocalizer.mapping.coverage import Standing
-from gam_relocalizer.mapping.facts import bytes_per_point, number_in
+from gam_relocalizer.mapping.facts import bytes_per_point, mapping_in, number_in, text_of
 from gam_relocalizer.plots import MAX_TILT_DEG, tilt_of, upward_direction
 from gam_relocalizer.scene_map import MANIFEST, SFM, load_map
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from scipy.sparse import csr_matrix
@@ -136,7 +136,12 @@ def check_map(path: Path) -> CheckReport:
         map_id=manifest.map_id,
         counts=manifest.counts,
         problems=(*inconsistencies(scene_map), *harmful),
-        warnings=(*harmless, *_warnings(scene_map, bridges), *_frame_warnings(scene_map)),
+        warnings=(
+            *harmless,
+            *_warnings(scene_map, bridges),
+            *_build_warnings(manifest),
+            *_frame_warnings(scene_map),
+        ),
         components=components,
         weak_bridges=bridges,
         points_per_image=(int(seen.min()), int(np.median(seen)), int(seen.max())),
@@ -218,7 +223,22 @@ def _frame_warnings(scene_map: SceneMap) -> list[str]:
             f'the scale of the map is known to {scale_sigma:.1%} only; align it with references '
             f'that lie further apart'
         )
-    remarks = manifest.alignment.get('warnings', ())
-    if isinstance(remarks, (list, tuple)):
-        warnings.extend(f'alignment: {remark}' for remark in remarks if isinstance(remark, str))
+    warnings.extend(f'alignment: {remark}' for remark in _remarks(manifest.alignment))
     return warnings
+
+
+def _build_warnings(manifest: Manifest) -> list[str]:
+    """What the build, and what was done to the map since, warned of."""
+    changes = manifest.build.get('changes')
+    warnings = [f'build: {text_of(one)}' for one in _remarks(mapping_in(manifest.build, 'report'))]
+    for change in changes if isinstance(changes, list) else []:
+        warnings.extend(f'change: {text_of(one)}' for one in _remarks(change))
+    return warnings
+
+
+def _remarks(record: object) -> list[str]:
+    """The texts under `warnings` of a mapping that came from a file."""
+    remarks = record.get('warnings') if isinstance(record, Mapping) else None
+    if not isinstance(remarks, (list, tuple)):
+        return []
+    return [remark for remark in remarks if isinstance(remark, str)]

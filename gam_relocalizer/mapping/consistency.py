@@ -12,18 +12,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.geometry import pose_error
-from gam_relocalizer.mapping.sfm import quiet_colmap
-from gam_relocalizer.scene_map import SFM, covisibility_of, verify_files
+from gam_relocalizer.mapping.leave_one_out import NO_POINT
+from gam_relocalizer.mapping.mapped_images import read_model_of
+from gam_relocalizer.scene_map import SFM, covisibility_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
+    from gam_relocalizer.mapping.colmap_model import ColmapModel, ModelImage
     from gam_relocalizer.scene_map import SceneMap
 
 # Points are stored in single precision and poses with twelve digits; both leave an error of less
@@ -42,11 +43,7 @@ def inconsistencies(scene_map: SceneMap) -> list[str]:
 
 def has_model(scene_map: SceneMap) -> bool:
     """Whether there is a COLMAP model beside the arrays."""
-    return bool(_sfm_files(scene_map))
-
-
-def _sfm_files(scene_map: SceneMap) -> list[str]:
-    return [name for name in scene_map.manifest.files if name.startswith(f'{SFM}/')]
+    return any(name.startswith(f'{SFM}/') for name in scene_map.manifest.files)
 
 
 def _covisibility(scene_map: SceneMap) -> Iterator[str]:
@@ -85,17 +82,14 @@ def _sfm(scene_map: SceneMap) -> Iterator[str]:
     """How the COLMAP model beside the arrays differs from them."""
     if not has_model(scene_map):
         return
-    folder = scene_map.path / SFM
     try:
-        verify_files(scene_map.path, scene_map.manifest, iter(_sfm_files(scene_map)))
-        with quiet_colmap():
-            model = pycolmap.Reconstruction(folder)
-    except (MapError, ValueError, RuntimeError) as err:
+        model = read_model_of(scene_map.path, scene_map.manifest)
+    except MapError as err:
         yield str(err)
         return
-    if model.num_points3D() != scene_map.num_points:
+    if len(model.points) != scene_map.num_points:
         yield (
-            f'{folder}: {model.num_points3D()} points, the map has {scene_map.num_points}; '
+            f'{model.folder}: {len(model.points)} points, the map has {scene_map.num_points}; '
             f'{_ADVICE}'
         )
         return
@@ -110,40 +104,37 @@ class _Comparison:
 
     Attributes:
         scene_map: The map.
-        model: The model, in its own frame.
-        point_ids: [N] ids of the model's points, rising: that of each row of the map.
+        model: The model, in its own frame; its points are in the order of the map.
         origin: [3] what the map's numbers count from.
     """
 
     scene_map: SceneMap
-    model: pycolmap.Reconstruction
-    point_ids: NDArray[np.uint64]
+    model: ColmapModel
     origin: NDArray[np.float64]
 
     @staticmethod
-    def of(scene_map: SceneMap, model: pycolmap.Reconstruction) -> _Comparison:
+    def of(scene_map: SceneMap, model: ColmapModel) -> _Comparison:
         manifest = scene_map.manifest
         return _Comparison(
             scene_map,
             model,
-            np.array(sorted(model.point3D_ids()), np.uint64),
             np.asarray(manifest.frame.map_from_sfm * np.array(manifest.points_origin)),
         )
 
     def points(self) -> Iterator[str]:
-        in_sfm = np.array([self.model.point3D(int(one)).xyz for one in self.point_ids])
-        expected = np.asarray(self.scene_map.manifest.frame.map_from_sfm * in_sfm)
+        map_from_sfm = self.scene_map.manifest.frame.map_from_sfm
+        expected = np.asarray(map_from_sfm * self.model.points)
         away = np.linalg.norm(self.scene_map.points - expected, axis=1)
         elsewhere = np.flatnonzero(~(away <= self._tolerance(expected)))
         if len(elsewhere):
             yield (
                 f'{self._folder}: {len(elsewhere)} of {len(away)} points lie elsewhere than in '
-                f'points.npy, the first is row {elsewhere[0]} (point {self.point_ids[elsewhere[0]]}'
-                f'), {away[elsewhere[0]]:.3g} map units away; {_ADVICE}'
+                f'points.npy, the first is row {elsewhere[0]}, {away[elsewhere[0]]:.3g} map units '
+                f'away; {_ADVICE}'
             )
 
     def images(self) -> Iterator[str]:
-        by_name = {one.name: one for one in self.model.images.values() if one.has_pose}
+        by_name = {one.name: one for one in self.model.images}
         names = self.scene_map.image_names
         missing = [name for name in names if name not in by_name]
         if missing:
@@ -165,17 +156,15 @@ class _Comparison:
                 f'map says, the first is `{names[other[0]]}`; {_ADVICE}'
             )
 
-    def _same_pose(self, row: int, image: pycolmap.Image) -> bool:
+    def _same_pose(self, row: int, image: ModelImage) -> bool:
         map_from_sfm = self.scene_map.manifest.frame.map_from_sfm
-        expected = map_from_sfm.transform_camera_world(image.cam_from_world())
+        expected = map_from_sfm.transform_camera_world(image.camera_from_world)
         error = pose_error(self.scene_map.camera_from_map[row], expected)
         near = error.position <= self._tolerance(self.scene_map.camera_positions[row])
         return bool(near) and error.rotation_deg <= _ROTATION_TOLERANCE_DEG
 
-    def _same_points(self, row: int, image: pycolmap.Image) -> bool:
-        observing = image.get_observation_point2D_idxs()
-        ids = np.array([image.point2D(int(one)).point3D_id for one in observing], np.uint64)
-        rows = np.unique(np.searchsorted(self.point_ids, ids))
+    def _same_points(self, row: int, image: ModelImage) -> bool:
+        rows = np.unique(image.points[image.points != NO_POINT])
         return np.array_equal(rows, self.scene_map.points_seen_by(row))
 
     def _tolerance(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -188,4 +177,4 @@ class _Comparison:
 
     @property
     def _folder(self) -> str:
-        return str(self.scene_map.path / SFM)
+        return str(self.model.folder)

@@ -20,7 +20,7 @@ from gam_relocalizer.features.registry import (
     create_extractor,
     global_descriptor_of,
 )
-from gam_relocalizer.mapping.build import check_names, check_output
+from gam_relocalizer.mapping.build import check_names, check_output, save_bundle
 from gam_relocalizer.mapping.extraction import extract_images
 from gam_relocalizer.mapping.intrinsics import assign_cameras
 from gam_relocalizer.mapping.mapped_images import (
@@ -35,6 +35,7 @@ from gam_relocalizer.mapping.mapped_images import (
 from gam_relocalizer.mapping.matching import match_pairs
 from gam_relocalizer.mapping.pairs import choose_pairs, choose_pairs_between
 from gam_relocalizer.mapping.progress import StepTimer, ignore_progress
+from gam_relocalizer.mapping.report import calibration_warnings
 from gam_relocalizer.mapping.sfm import (
     SfmInput,
     add_images,
@@ -44,7 +45,7 @@ from gam_relocalizer.mapping.sfm import (
     write_database,
     write_geometries,
 )
-from gam_relocalizer.scene_map import load_map, save_map
+from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -78,6 +79,7 @@ class ExtendReport:
         observations: Their observations.
         mean_reprojection_error: Over all observations [px].
         seconds: Time per step.
+        warnings: What to look at before the map is trusted.
     """
 
     images_given: int
@@ -91,6 +93,7 @@ class ExtendReport:
     observations: int
     mean_reprojection_error: float
     seconds: Mapping[str, float]
+    warnings: tuple[str, ...] = ()
 
 
 def extend_map(
@@ -160,14 +163,16 @@ def extend_map(
         np.concatenate([mapped.content.global_descriptors, described]),
         mapped.content.codebook,
     )
+    warnings = calibration_warnings(joined.cameras, dict(model.cameras.items()))
     change = {
         'what': 'extend',
-        'images': images.folder.absolute().name,
+        'images': images.source,
         'prefix': prefix,
         'images_given': len(images.names),
         'images_registered': len(registered),
+        'warnings': list(warnings),
     }
-    save_map(out, content, changed_manifest(mapped.manifest, change, model), model)
+    save_bundle(out, content, changed_manifest(mapped.manifest, change, model), model)
     progress('save', 1, 1)
     return ExtendReport(
         images_given=len(images.names),
@@ -181,6 +186,7 @@ def extend_map(
         observations=len(content.observation_points),
         mean_reprojection_error=model.compute_mean_reprojection_error(),
         seconds={step: round(seconds, 2) for step, seconds in timer.seconds.items()},
+        warnings=warnings,
     )
 
 

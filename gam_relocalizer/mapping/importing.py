@@ -22,8 +22,10 @@ from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.mapping.build import (
     MapBuildOptions,
     build_map,
+    check_descriptor_bits,
     check_names,
     check_output,
+    save_bundle,
 )
 from gam_relocalizer.mapping.colmap_model import read_colmap_model
 from gam_relocalizer.mapping.extraction import MappingImage
@@ -33,7 +35,7 @@ from gam_relocalizer.mapping.mapped_images import assemble, content_of
 from gam_relocalizer.mapping.progress import StepTimer, ignore_progress
 from gam_relocalizer.mapping.report import BuildReport
 from gam_relocalizer.mapping.sfm import MIN_IMAGES, numbered_by_sight, quiet_colmap
-from gam_relocalizer.scene_map import Manifest, MapFrame, save_map
+from gam_relocalizer.scene_map import Manifest, MapFrame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -169,6 +171,7 @@ def import_model_with_features(
     out: Path,
     *,
     metric: bool = False,
+    descriptor_bits: int = 16,
     progress: Progress = ignore_progress,
 ) -> tuple[BuildReport, ModelSummary]:
     """A map of a COLMAP model and the features it was made of; no image is needed.
@@ -181,15 +184,18 @@ def import_model_with_features(
         features: As many of each image as the model has keypoints.
         out: The bundle.
         metric: Whether the unit of the model is a metre.
+        descriptor_bits: That the map keeps of each number of a local descriptor: 16 or 8.
         progress: Told of the steps extract, sfm and save.
 
     Raises:
         ModelError: The model is damaged or empty, or the features do not fit it.
-        UsageError: Unknown extractor, or names of images that a map cannot hold.
+        UsageError: Unknown extractor, an impossible number of bits, or names of images that a map
+            cannot hold.
         WeightsError: The weights of the extractor are missing or damaged.
         MapError: `out` exists and is not a map bundle, or cannot be written.
     """
     check_output(out)
+    check_descriptor_bits(descriptor_bits)
     extractor = create_extractor(features.extractor)
     model = read_colmap_model(folder)
     source = _image_set(model, folder, metric=metric)
@@ -208,10 +214,11 @@ def import_model_with_features(
     manifest = Manifest(
         extractor=extractor.identity,
         retrieval=vlad.name,
+        descriptor_bits=descriptor_bits,
         frame=MapFrame(metric=metric, source='the imported COLMAP model'),
         counts={},
         build={
-            'images': folder.absolute().name,
+            'images': source.source,
             'options': {'imported': 'a COLMAP model and its features'},
             'software': {
                 'gam_relocalizer': __version__,
@@ -222,7 +229,7 @@ def import_model_with_features(
         },
     )
     progress('save', 0, 1)
-    save_map(out, content, manifest, reconstruction)
+    save_bundle(out, content, manifest, reconstruction)
     progress('save', 1, 1)
     return report, _summary(model)
 

@@ -8,13 +8,11 @@ map brings its own labels to train a matcher on, and its own truth to measure on
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
@@ -23,13 +21,13 @@ from gam_relocalizer.features.registry import create_extractor
 from gam_relocalizer.images import read_image
 from gam_relocalizer.map_encoding import unit_rows
 from gam_relocalizer.mapping.progress import ignore_progress
-from gam_relocalizer.mapping.sfm import quiet_colmap
-from gam_relocalizer.scene_map import SFM, SceneMap, verify_files
+from gam_relocalizer.scene_map import SceneMap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    import pycolmap
     from numpy.typing import NDArray
 
     from gam_relocalizer.features.local import LocalExtractor
@@ -291,60 +289,15 @@ class _ObservedImage:
 
 def _read_observed_images(scene_map: SceneMap) -> list[_ObservedImage]:
     """The map's images, in its order."""
-    model = _read_model(scene_map)
-    # the rows of a map follow the ids of COLMAP's points, rising
-    point_ids = np.array(sorted(model.point3D_ids()), dtype=np.uint64)
-    by_name = {image.name: image for image in model.images.values()}
-    missing = [name for name in scene_map.image_names if name not in by_name]
-    if missing:
-        msg = (
-            f'{scene_map.path / SFM}: lacks image `{missing[0]}` of the map; build it again with '
-            f'`map build`'
-        )
-        raise MapError(msg)
-    images = [by_name[name] for name in scene_map.image_names]
-    # the model owns its cameras, and is gone when its images are in use
-    cameras = {camera_id: copy(camera) for camera_id, camera in model.cameras.items()}
-    return [_observed_image(image, cameras[image.camera_id], point_ids) for image in images]
+    # these rooms take NO_POINT from here
+    from gam_relocalizer.mapping.mapped_images import images_in_order, read_model_of
 
-
-def _observed_image(
-    image: pycolmap.Image, camera: pycolmap.Camera, point_ids: NDArray[np.uint64]
-) -> _ObservedImage:
-    observing = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
-    seen = np.array([image.point2D(int(one)).point3D_id for one in observing], dtype=np.uint64)
-    point_of_keypoint = np.full(image.num_points2D(), NO_POINT)
-    point_of_keypoint[observing] = np.searchsorted(point_ids, seen)
-    return _ObservedImage(
-        name=image.name,
-        camera=camera,
-        keypoints=np.array([point.xy for point in image.points2D]).reshape(-1, 2),
-        point_of_keypoint=point_of_keypoint,
-    )
-
-
-def _read_model(scene_map: SceneMap) -> pycolmap.Reconstruction:
-    names = [name for name in scene_map.manifest.files if name.startswith(f'{SFM}/')]
-    if not names:
-        msg = (
-            f'{scene_map.path}: has no COLMAP model ({SFM}/), which holds the tracks; '
-            f'build it again with `map build`'
-        )
-        raise MapError(msg)
-    verify_files(scene_map.path, scene_map.manifest, iter(names))
-    try:
-        with quiet_colmap():
-            model = pycolmap.Reconstruction(scene_map.path / SFM)
-    except (ValueError, RuntimeError) as err:
-        msg = f'{scene_map.path / SFM}: cannot be read as a COLMAP model: {err}'
-        raise MapError(msg) from err
-    if model.num_points3D() != scene_map.num_points:
-        msg = (
-            f'{scene_map.path / SFM}: {model.num_points3D()} points, the map has '
-            f'{scene_map.num_points}; build it again with `map build`'
-        )
-        raise MapError(msg)
-    return model
+    model = read_model_of(scene_map.path, scene_map.manifest)
+    images = images_in_order(model, scene_map.image_names, scene_map.num_points)
+    return [
+        _ObservedImage(image.name, model.cameras[image.camera_id], image.keypoints, image.points)
+        for image in images
+    ]
 
 
 def _extractor_of(scene_map: SceneMap) -> LocalExtractor:

@@ -71,16 +71,8 @@ def read_mapped_images(path: Path) -> MappedImages:
         MapError: The map is damaged, or has no COLMAP model that fits it.
     """
     manifest, content = load_content(path)
-    model = _read_model(path, manifest)
-    by_name = {image.name: image for image in model.images}
-    missing = [name for name in content.image_names if name not in by_name]
-    if missing or len(model.points) != len(content.points):
-        msg = (
-            f'{path / SFM}: {len(by_name)} images and {len(model.points)} points, the map has '
-            f'{len(content.image_names)} and {len(content.points)}; build it again with `map build`'
-        )
-        raise MapError(msg)
-    known = [by_name[name] for name in content.image_names]
+    model = read_model_of(path, manifest)
+    known = images_in_order(model, content.image_names, len(content.points))
     cameras = _cameras_of(model, known)
     images = tuple(
         _mapping_image(image, cameras.of(index), content.descriptors)
@@ -96,6 +88,46 @@ def read_mapped_images(path: Path) -> MappedImages:
         points=model.points,
         point_of_keypoint=tuple(image.points for image in known),
     )
+
+
+def read_model_of(path: Path, manifest: Manifest) -> ColmapModel:
+    """Reads the COLMAP model of a map, which comes from anywhere.
+
+    Raises:
+        MapError: There is none, or it is damaged.
+    """
+    names = [name for name in manifest.files if name.startswith(f'{SFM}/')]
+    if not names:
+        msg = (
+            f'{path}: has no COLMAP model ({SFM}/), which holds the keypoints and tracks of its '
+            f'images; build it again with `map build`'
+        )
+        raise MapError(msg)
+    verify_files(path, manifest, iter(names))
+    try:
+        return read_colmap_model(path / SFM)
+    except ModelError as err:
+        raise MapError(str(err)) from err
+
+
+def images_in_order(
+    model: ColmapModel, image_names: Sequence[str], num_points: int
+) -> list[ModelImage]:
+    """The images of a model in the order of its map.
+
+    Raises:
+        MapError: The model is not that of a map with such images and points.
+    """
+    by_name = {image.name: image for image in model.images}
+    missing = [name for name in image_names if name not in by_name]
+    if missing or len(model.points) != num_points:
+        lacks = f', and lacks `{missing[0]}`' if missing else ''
+        msg = (
+            f'{model.folder}: {len(by_name)} images and {len(model.points)} points, the map has '
+            f'{len(image_names)} and {num_points}{lacks}; build it again with `map build`'
+        )
+        raise MapError(msg)
+    return [by_name[name] for name in image_names]
 
 
 def assemble(
@@ -234,21 +266,6 @@ def changed_manifest(
             'cameras': [format_camera(camera) for _, camera in sorted(model.cameras.items())],
         }
     return replace(manifest, build=build)
-
-
-def _read_model(path: Path, manifest: Manifest) -> ColmapModel:
-    names = [name for name in manifest.files if name.startswith(f'{SFM}/')]
-    if not names:
-        msg = (
-            f'{path}: has no COLMAP model ({SFM}/), which holds the keypoints and tracks of its '
-            f'images; build it again with `map build`'
-        )
-        raise MapError(msg)
-    verify_files(path, manifest, iter(names))
-    try:
-        return read_colmap_model(path / SFM)
-    except ModelError as err:
-        raise MapError(str(err)) from err
 
 
 def _cameras_of(model: ColmapModel, images: Sequence[ModelImage]) -> ImageCameras:

@@ -123,7 +123,8 @@ def prune_map(
         msg = f'--keep is {keep:g}; expected a share of the size above 0 and at most 1'
         raise UsageError(msg)
     if descriptor_bits not in DESCRIPTOR_BITS:
-        msg = f'--descriptor-bits is {descriptor_bits}; known are {DESCRIPTOR_BITS}'
+        known = ' or '.join(map(str, DESCRIPTOR_BITS))
+        msg = f'--descriptor-bits is {descriptor_bits}; expected {known}'
         raise UsageError(msg)
     check_output(out)
     scene_map, mapped = load_map(path), read_mapped_images(path)

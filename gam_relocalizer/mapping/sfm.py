@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -298,19 +297,6 @@ def numbered_by_sight(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction
     for new, old in enumerate(ids[order], start=1):
         numbered.add_point3D_with_id(new, model.point3D(int(old)))
     return numbered
-
-
-def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Writes COLMAP's binary files; unlike COLMAP itself, it notices when the disk is full.
-
-    Raises:
-        OSError: The disk is full.
-    """
-    model.write_binary(folder)
-    last = folder / 'points3D.bin'
-    expected = 8 + 51 * model.num_points3D() + 8 * model.compute_num_observations()
-    if last.stat().st_size != expected:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(last))
 
 
 def _first_and_last_image(point: pycolmap.Point3D) -> tuple[int, int]:

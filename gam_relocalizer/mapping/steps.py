@@ -37,9 +37,9 @@ from gam_relocalizer.mapping.sfm import (
     verify_pairs,
     write_database,
     write_geometries,
-    write_model,
 )
 from gam_relocalizer.mapping.workspace import key_of
+from gam_relocalizer.scene_map import write_model
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

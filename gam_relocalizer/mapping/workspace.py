@@ -178,7 +178,17 @@ class Workspace:
 
 def workspace_of(out: Path) -> Path:
     """Where the workspace of a map lies: beside the bundle `out`."""
-    return Path(f'{out.absolute()}.work')
+    return _beside(out, 'work')
+
+
+def report_of(out: Path) -> Path:
+    """Where the report of a build lies: beside the bundle `out`."""
+    return _beside(out, 'report')
+
+
+def _beside(out: Path, ending: str) -> Path:
+    # `.` and `..` have no name of their own
+    return Path(f'{out.resolve()}.{ending}')
 
 
 @contextmanager

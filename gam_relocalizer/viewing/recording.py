@@ -84,11 +84,14 @@ def write_recording(file: Path, scene_map: SceneMap, drive: Drive | None = None)
     except RuntimeError as err:
         msg = f'{file}: cannot be written: {err}'
         raise UsageError(msg) from err
-    _record_map(rerun, recording, scene_map)
-    if drive is not None:
-        _record_drive(rerun, recording, drive)
-    recording.disconnect()
-    temporary.replace(file)
+    try:
+        _record_map(rerun, recording, scene_map)
+        if drive is not None:
+            _record_drive(rerun, recording, drive)
+        recording.disconnect()
+        temporary.replace(file)
+    finally:  # Ctrl-C too leaves nothing half-written
+        temporary.unlink(missing_ok=True)
 
 
 def _blueprint(rerun: Any, *, with_drive: bool) -> Any:  # noqa: ANN401 - rerun comes on demand

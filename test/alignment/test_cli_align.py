@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from typing import TYPE_CHECKING
 
 import cv2
@@ -97,6 +98,33 @@ def test_aligns_to_an_occupancy_map_with_a_picture(room: SurveyedRoom, tmp_path:
     assert done.exit_code == 0
     assert room.errors()[0] < 0.01
     assert (tmp_path / 'plan.png').is_file()
+
+
+@pytest.mark.parametrize('name', ['pipe', 'folder', 'nosuch/plan.png'])
+def test_a_picture_that_cannot_be_put_in_place_is_refused_before_the_work(
+    room: SurveyedRoom, tmp_path: Path, name: str
+) -> None:
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'folder').mkdir()
+    cv2.imwrite(str(tmp_path / 'plan.png'), np.full((300, 400), 254, np.uint8))
+    plan = tmp_path / 'plan.yaml'
+    plan.write_text('image: plan.png\nresolution: 0.05\norigin: [-10, -7, 0]\n')
+    pixels = {
+        name: np.array([(x + 10) / 0.05, 300 - (y + 7) / 0.05])
+        for name, (x, y, _) in room.positions.items()
+    }
+    picks = write_lines(tmp_path / 'picks.txt', pixels)
+    before = (room.path / MANIFEST).read_bytes()
+
+    done = run(
+        *(room, '--occupancy', plan, '--picks', picks, '--level'),
+        *('--picture', tmp_path / name),
+    )
+
+    assert isinstance(done.exception, UsageError)
+    assert (room.path / MANIFEST).read_bytes() == before
+    assert (tmp_path / 'pipe').is_fifo()
+    assert sorted(one.name for one in tmp_path.iterdir() if one.name.startswith('.')) == []
 
 
 def test_aligns_by_distances_and_levels(room: SurveyedRoom, tmp_path: Path) -> None:

@@ -52,6 +52,15 @@ def test_markers_have_a_centre_and_perhaps_an_orientation(tmp_path: Path) -> Non
     assert read_marker_places(file) == places
 
 
+@pytest.mark.parametrize('metres', ['0', '-2', '1e300', '1e-300'])
+def test_a_distance_that_nothing_has_is_refused(metres: str, tmp_path: Path) -> None:
+    file = tmp_path / 'distances.txt'
+    file.write_text(f'a.png b.png {metres}\n')
+
+    with pytest.raises(UsageError, match=':1: a distance'):
+        read_distances(file)
+
+
 @pytest.mark.parametrize('read', READERS)
 @pytest.mark.parametrize('spoil', ['1 2', '{} x', '{} nan'])
 def test_a_malformed_line_is_named(

@@ -219,6 +219,18 @@ def test_mirrored_places_are_refused_by_that_name(kind: str) -> None:
         fit_by(kind, source, mirrored, rng)
 
 
+@pytest.mark.parametrize('kind', ['places', 'upright', 'poses'])
+@pytest.mark.parametrize('size', [1e100, 1e308])
+def test_places_beyond_all_measure_are_refused(kind: str, size: float) -> None:
+    rng = np.random.default_rng(16)
+    source = room_of_places(5, rng)
+    target = source.copy()
+    target[:2, 0] = [size, -size]
+
+    with pytest.raises(AlignmentError, match='from the origin'):
+        fit_by(kind, source, target, rng)
+
+
 def test_exact_places_in_a_plane_are_not_taken_for_mirrored_ones() -> None:
     source = room_of_places(20, np.random.default_rng(15)) * [1.0, 1.0, 0.0]
 

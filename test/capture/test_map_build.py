@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,6 +83,39 @@ def test_says_what_became_of_the_frames_and_how_well_the_map_fits(
     _, output = built
     for word in ('frames read', 'blurred', 'keyframes', '/odom', 'residual', 'scale'):
         assert word in output
+
+
+def test_a_map_of_a_bag_is_named_after_it(
+    built: tuple[SceneMap, str], tiny_place: TinyPlace
+) -> None:
+    assert built[0].manifest.build['images'] == tiny_place.bag.name
+
+
+def test_a_bag_extends_a_map_in_place_and_the_images_of_both_remain(
+    built: tuple[SceneMap, str], tiny_place: TinyPlace, tmp_path: Path
+) -> None:
+    before, _ = built
+    out = tmp_path / 'map'
+    shutil.copytree(before.path, out)
+    shutil.copytree(f'{before.path}.work', f'{out}.work')
+    shutil.copytree(tiny_place.bag, tmp_path / 'day 2')
+
+    arguments = ['--bag', str(tmp_path / 'day 2'), '--prefix', 'day2/', '--out', str(out)]
+    done = run('extend', str(out), *arguments)
+    assert done.exit_code == 0, done.exception
+
+    after = load_map(out)
+    (change,) = after.manifest.build['changes']
+    keyframes = set((tmp_path / 'map.work' / 'keyframes').iterdir())
+    (added,) = (folder for folder in keyframes if str(folder) in done.stdout)
+    (there,) = keyframes - {added}
+
+    assert change['images'] == 'day 2'
+    assert after.image_names[: before.num_images] == before.image_names
+    assert after.num_images > 1.9 * before.num_images
+    for name in after.image_names:
+        is_added = name.startswith('day2/')
+        assert ((added / name[len('day2/') :]) if is_added else (there / name)).is_file()
 
 
 @pytest.mark.parametrize(

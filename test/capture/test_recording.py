@@ -178,6 +178,29 @@ def test_odometry_and_mount_give_poses_of_the_camera(full_bag: Path, workspace: 
         assert error.rotation_deg < 1e-4
 
 
+def test_places_that_nobody_wants_to_know_are_not_looked_for(
+    tmp_path: Path, workspace: Workspace
+) -> None:
+    def fill(bag: BagWriter) -> None:
+        for index in range(5):
+            write_image(bag, index)
+            for topic in ('/odom', '/wheel_odom'):
+                head, odom_from_base = (
+                    header(stamp_of(index), 'odom'),
+                    pose(map_from_base_at(index)),
+                )
+                fields = odometry_fields(odom_from_base, 'base_link')
+                bag.write(topic, 'nav_msgs/msg/Odometry', stamp_of(index), header=head, **fields)
+
+    bag = write_bag(tmp_path / 'drive', fill)
+
+    with pytest.raises(BagError, match='--odom-topic'):
+        capture_bag(bag, workspace)
+    capture = capture_bag(bag, workspace, BagOptions(whereabouts=None))
+    assert capture.references == ()
+    assert capture.images.source == 'drive'
+
+
 def test_gps_comes_after_odometry_and_is_interpolated(full_bag: Path, workspace: Workspace) -> None:
     capture = capture_bag(full_bag, workspace)
 

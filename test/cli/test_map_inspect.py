@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 from dataclasses import replace
@@ -246,6 +247,32 @@ def test_view_saves_a_recording_of_every_point(path: Path, tmp_path: Path) -> No
     ]
     np.testing.assert_allclose(points, load_map(path).points, rtol=1e-5, atol=1e-6)
     assert [file.name for file in tmp_path.iterdir()] == ['map.rrd']
+
+
+@pytest.mark.parametrize('options', [['--every', '3'], ['--global-weights', 'weights.mat']])
+def test_check_refuses_options_that_nothing_follows_from(path: Path, options: list[str]) -> None:
+    assert isinstance(run('check', str(path), *options).exception, UsageError)
+
+
+def test_check_refuses_a_folder_below_a_file(path: Path, tmp_path: Path) -> None:
+    (tmp_path / 'file').touch()
+
+    done = run('check', str(path), '--out', str(tmp_path / 'file' / 'deeper' / 'out'))
+
+    assert isinstance(done.exception, UsageError)
+
+
+@pytest.mark.parametrize('name', ['pipe', 'folder', 'nosuch/map.rrd'])
+def test_view_does_not_replace_what_is_no_file(path: Path, tmp_path: Path, name: str) -> None:
+    pytest.importorskip('rerun', reason='the extra `view` is not installed')
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'folder').mkdir()
+
+    done = run('view', str(path), '--save', str(tmp_path / name))
+
+    assert isinstance(done.exception, UsageError)
+    assert (tmp_path / 'pipe').is_fifo()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ['folder', 'pipe']
 
 
 def test_view_without_the_viewer_tells_how_to_get_it(

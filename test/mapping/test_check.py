@@ -36,6 +36,15 @@ if TYPE_CHECKING:
 MANIFEST_TO_BE = Manifest(ExtractorIdentity('xfeat', 4, ''), 'vlad', MapFrame(metric=True), {})
 
 
+def truncate(path: Path, name: str) -> None:
+    """Cuts a file of a map short, and lets the manifest say that it is to be so."""
+    file = path / name
+    file.write_bytes(file.read_bytes()[:-7])
+    manifest = yaml.safe_load((path / MANIFEST).read_text())
+    manifest['files'][name] = {'size': file.stat().st_size, 'sha256': sha256_of(file)}
+    (path / MANIFEST).write_text(yaml.safe_dump(manifest))
+
+
 def content_seeing(seen: list[range]) -> MapContent:
     """Images that see the given ranges of 200 points."""
     return MapContent(
@@ -65,6 +74,18 @@ def test_a_damaged_file_is_a_problem(posed_map: BuiltMap, tmp_path: Path, name: 
     (damaged / name).write_bytes((damaged / name).read_bytes()[:-7])
 
     (problem,) = check_map(damaged).problems
+
+    assert name in problem
+
+
+@pytest.mark.parametrize('name', ['images.bin', 'points3D.bin', 'cameras.bin'])
+def test_a_truncated_model_that_the_manifest_vouches_for_is_a_problem(
+    posed_map: BuiltMap, tmp_path: Path, name: str
+) -> None:
+    shutil.copytree(posed_map.path, tmp_path / 'map')
+    truncate(tmp_path / 'map', f'{SFM}/{name}')
+
+    (problem,) = check_map(tmp_path / 'map').problems
 
     assert name in problem
 
@@ -291,6 +312,32 @@ def test_what_the_alignment_says_of_itself_is_passed_on(
     save_frame(path, MapFrame(metric=True), alignment)
 
     assert len(check_map(path).warnings) == warnings
+
+
+@pytest.mark.parametrize(
+    ('build', 'warnings'),
+    [
+        ({'report': {'warnings': ['camera 1: folded']}}, ['build: camera 1: folded']),
+        ({'report': {'warnings': []}, 'changes': []}, []),
+        (
+            {'changes': [{'what': 'merge'}, {'warnings': ['camera 2: odd']}]},
+            ['change: camera 2: odd'],
+        ),
+        ({'report': {'warnings': ['\x1b[2J' + 'a' * 1000]}}, ['build: ?[2J' + 'a' * 193 + '...']),
+        ({'report': {'warnings': 'all'}, 'changes': {'warnings': ['a']}}, []),
+        ({'report': ['warnings'], 'changes': [1, ['warnings'], {'warnings': {'a': 1}}]}, []),
+        ({'report': {'warnings': [1, None, ['a']]}}, []),
+    ],
+)
+def test_what_the_build_warned_of_is_repeated(
+    posed_map: BuiltMap, tmp_path: Path, build: dict[str, object], warnings: list[str]
+) -> None:
+    manifest, content = load_content(posed_map.path)
+    save_map(tmp_path / 'map', content, replace(manifest, build=build), None)
+
+    found = check_map(tmp_path / 'map').warnings
+
+    assert [one for one in found if one.startswith(('build: ', 'change: '))] == warnings
 
 
 def test_says_what_was_not_checked(posed_map: BuiltMap, tmp_path: Path) -> None:

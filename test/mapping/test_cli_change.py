@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import cv2
+import pytest
 from corner_room import CornerRoom, looking_into_the_corner
 from typer.testing import CliRunner
 
 from gam_relocalizer.cli.map import app
-from gam_relocalizer.errors import UsageError
+from gam_relocalizer.errors import BagError, UsageError, VideoError
 from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
@@ -42,6 +43,35 @@ def test_extend_adds_a_folder_of_images_under_a_prefix(posed_map: BuiltMap, tmp_
 
     assert 'day2/view 00.png' in load_map(tmp_path / 'map').image_names
     assert '1 of 1' in printed
+
+
+@pytest.mark.parametrize(
+    'words',
+    [
+        [],
+        ['--images', '.', '--video', 'walk.mp4'],
+        ['--video', 'walk.mp4', '--image-topic', '/image'],
+        ['--images', '.', '--image-is-rectified'],
+    ],
+)
+def test_extend_takes_one_source_and_its_options(
+    words: list[str], posed_map: BuiltMap, tmp_path: Path
+) -> None:
+    arguments = ['extend', str(posed_map.path), *words, '--out', str(tmp_path / 'map')]
+
+    assert isinstance(CliRunner().invoke(app, arguments).exception, UsageError)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(('source', 'error'), [('--video', VideoError), ('--bag', BagError)])
+def test_extend_by_a_source_that_is_missing_leaves_nothing(
+    source: str, error: type[Exception], posed_map: BuiltMap, tmp_path: Path
+) -> None:
+    nothing, out = str(tmp_path / 'nothing'), str(tmp_path / 'map')
+    arguments = ['extend', str(posed_map.path), source, nothing, '--out', out]
+
+    assert isinstance(CliRunner().invoke(app, arguments).exception, error)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_merge_joins_two_maps(posed_map: BuiltMap, free_map: BuiltMap, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -17,8 +18,6 @@ from gam_relocalizer.mapping.workspace import open_workspace
 from gam_relocalizer.scene_map import load_map, read_manifest
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from click.testing import Result
     from conftest import BuiltMap, Room
 
@@ -71,6 +70,41 @@ def test_keeps_the_finished_steps_beside_the_map_until_told_otherwise(
     assert 'match 28 pairs' in again.stdout
     assert read_manifest(out).descriptor_bits == 8
     assert not work.exists()
+
+
+def test_a_camera_that_came_out_elsewhere_is_warned_of_in_output_report_and_check(
+    room: Room, tmp_path: Path
+) -> None:
+    out = tmp_path / 'map'
+    arguments = ('--poses', str(room.images.parent / 'poses.txt'), '--refine-camera')
+
+    built = run(
+        'build',
+        *('--images', str(room.images)),
+        *('--out', str(out)),
+        *('--camera', 'SIMPLE_PINHOLE 384 288 480 192 144'),
+        *('--max-keypoints', '600'),
+        *arguments,
+    )
+    (warning,) = json.loads((tmp_path / 'map.report' / 'report.json').read_text())['warnings']
+
+    assert '480 px' in warning
+    assert f'warning: {warning}' in built.stdout
+    assert f'warning: build: {warning}' in run('check', str(out)).stdout
+
+
+def test_a_map_may_be_built_anew_from_inside_its_folder(
+    room: Room, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / 'map'
+    build(room, out)
+    monkeypatch.chdir(out)
+
+    again = build(room, Path(), '--descriptor-bits', '8')
+
+    assert again.exit_code == 0, again.exception
+    assert read_manifest(out).descriptor_bits == 8
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['map', 'map.report', 'map.work']
 
 
 def test_a_build_of_a_map_that_is_being_built_is_refused(room: Room, tmp_path: Path) -> None:

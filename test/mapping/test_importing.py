@@ -177,6 +177,19 @@ def test_an_output_of_hloc_is_the_same_map(
     assert np.allclose(found.descriptors_of(rows), expected.descriptors_of(rows), atol=2e-3)
 
 
+def test_an_import_takes_the_options_of_a_build_and_leaves_its_report(
+    foreign: ForeignModel, room: Room, tmp_path: Path
+) -> None:
+    out, database = tmp_path / 'map', foreign.database
+    imported(foreign.sfm, out, '--database', database, '--descriptor-bits', 8)
+    assert load_map(out).manifest.descriptor_bits == 8
+    assert (tmp_path / 'map.report' / 'report.json').is_file()
+
+    imported(foreign.sfm, out, '--images', room.images, *FEW, '--discard-work')
+    assert load_map(out).manifest.descriptor_bits == 16
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['map', 'map.report']
+
+
 def test_the_same_import_gives_the_same_map_and_leaves_its_source_alone(
     foreign: ForeignModel, database_map: Path, tmp_path: Path
 ) -> None:
@@ -230,6 +243,7 @@ def test_a_model_whose_points_nobody_sees_is_refused(foreign: ForeignModel, tmp_
         ['--features', 'x.h5', '--extractor', 'magic'],
         ['--database', 'x.db', '--extractor', 'xfeat'],
         ['--database', 'x.db', '--refine-camera'],
+        ['--database', 'x.db', '--discard-work'],
         ['--database', 'x.db', '--global', 'netvlad'],
     ],
 )

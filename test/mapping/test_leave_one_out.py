@@ -31,12 +31,14 @@ from gam_relocalizer.mapping.leave_one_out import (
 from gam_relocalizer.scene_map import (
     SFM,
     ExtractorIdentity,
+    FileEntry,
     Manifest,
     MapContent,
     MapFrame,
     SceneMap,
     load_map,
     map_in_memory,
+    sha256_of,
 )
 
 if TYPE_CHECKING:
@@ -273,6 +275,21 @@ def test_rejects_a_damaged_model(posed_map: BuiltMap, room: Room, tmp_path: Path
     file.write_bytes(file.read_bytes()[:-7])
     with pytest.raises(MapError, match=r'images\.bin'):
         read_reference_images(load_map(tmp_path / 'map'), room.images)
+
+
+def test_rejects_a_truncated_model_that_the_manifest_vouches_for(
+    posed_map: BuiltMap, room: Room, tmp_path: Path
+) -> None:
+    shutil.copytree(posed_map.path, tmp_path / 'map')
+    file = tmp_path / 'map' / SFM / 'images.bin'
+    file.write_bytes(file.read_bytes()[:-7])
+    scene_map = load_map(tmp_path / 'map')
+    entry = FileEntry(file.stat().st_size, sha256_of(file))
+    files = {**scene_map.manifest.files, f'{SFM}/images.bin': entry}
+    vouched = replace(scene_map, manifest=replace(scene_map.manifest, files=files))
+
+    with pytest.raises(MapError, match=r'images\.bin'):
+        read_reference_images(vouched, room.images)
 
 
 @given(st.permutations(range(12)), st.integers(0, 12))

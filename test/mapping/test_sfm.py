@@ -19,8 +19,8 @@ from gam_relocalizer.mapping.sfm import (
     numbered_by_sight,
     verify_pairs,
     write_database,
-    write_model,
 )
+from gam_relocalizer.scene_map import write_model
 
 if TYPE_CHECKING:
     from pathlib import Path

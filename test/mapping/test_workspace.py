@@ -6,7 +6,7 @@ import hashlib
 import io
 import subprocess
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +16,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 from gam_relocalizer.errors import MapBuildError
-from gam_relocalizer.mapping.workspace import MARKER, key_of, open_workspace, workspace_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from gam_relocalizer.mapping.workspace import (
+    MARKER,
+    key_of,
+    open_workspace,
+    report_of,
+    workspace_of,
+)
 
 KEY = key_of(image='a')
 ARRAYS = {'numbers': np.arange(1000.0), 'text': np.array('a name')}
@@ -240,3 +243,17 @@ def test_keys_tell_inputs_apart() -> None:
 
 def test_lies_beside_the_map(tmp_path: Path) -> None:
     assert workspace_of(tmp_path / 'office.map') == tmp_path / 'office.map.work'
+
+
+@pytest.mark.parametrize('out', ['office.map', '.', '..', 'inner/..', '../place', 'link'])
+def test_workspace_and_report_lie_beside_the_map_however_it_is_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
+) -> None:
+    place = tmp_path / 'outer' / 'place'
+    (place / 'inner').mkdir(parents=True)
+    (place / 'link').symlink_to(place / 'inner')
+    monkeypatch.chdir(place)
+    bundle = (place / out).resolve()
+
+    assert workspace_of(Path(out)) == bundle.parent / f'{bundle.name}.work'
+    assert report_of(Path(out)) == bundle.parent / f'{bundle.name}.report'

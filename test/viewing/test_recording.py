@@ -255,3 +255,19 @@ def test_the_library_is_imported_on_demand() -> None:
     code = 'import sys, gam_relocalizer.viewing.recording as r; sys.exit("rerun" in sys.modules)'
 
     assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0
+
+
+def test_a_recording_that_is_not_finished_leaves_nothing_behind(
+    model: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene_map = save_model(tmp_path / 'map', model)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recordings, '_record_map', interrupt)
+
+    with pytest.raises(KeyboardInterrupt):
+        write_recording(tmp_path / 'map.rrd', scene_map)
+
+    assert [file.name for file in tmp_path.iterdir()] == ['map']

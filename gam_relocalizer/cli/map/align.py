@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gam_relocalizer.cli.map.outputs import check_file_to_write
 from gam_relocalizer.cli.map.printing import MapArgument, print_table, progress_bars, some_of
 from gam_relocalizer.errors import UsageError
 
@@ -134,6 +135,8 @@ def align(  # noqa: PLR0913 - one argument per option
         picture=picture,
     )
     _check_combination(given)
+    if picture is not None:
+        check_file_to_write(picture, '--picture')
 
     from gam_relocalizer.alignment.align import align_map
     from gam_relocalizer.alignment.constraints import Picks
@@ -267,7 +270,8 @@ def _frame_rows(findings: Findings) -> dict[str, str]:
     if findings.roll_median_deg is not None:
         rows['cameras'] = f'rolled by {findings.roll_median_deg:.2f} degrees in the median'
     if findings.floor_points is not None:
-        rows['floor'] = f'{findings.floor_points} points on it'
+        count = findings.floor_points
+        rows['floor'] = f'{count} points on it' if count else 'none found'
     if findings.datum is not None:
         latitude, longitude, altitude = findings.datum
         rows['origin'] = f'{latitude:.8f} {longitude:.8f} {altitude:.3f} (WGS 84)'

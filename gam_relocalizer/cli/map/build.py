@@ -6,11 +6,17 @@ from __future__ import annotations
 
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from gam_relocalizer.cli.map.printing import print_table, progress_bars, some_of
+from gam_relocalizer.cli.map.printing import (
+    BitsOption,
+    DiscardOption,
+    OutOption,
+    print_build,
+    progress_bars,
+)
 from gam_relocalizer.cli.map.sources import (
     BagOption,
     BaseFrameOption,
@@ -28,12 +34,6 @@ from gam_relocalizer.cli.map.sources import (
 )
 from gam_relocalizer.cli.options import GlobalWeightsOption
 
-if TYPE_CHECKING:
-    from gam_relocalizer.mapping.report import BuildReport
-    from gam_relocalizer.mapping.workspace import Workspace
-
-_UNITS = {'extract': 'images', 'match': 'pairs', 'verify': 'pairs', 'sfm': 'images'}
-
 
 class Mapper(str, Enum):
     """The ways to recover poses when none are given."""
@@ -47,7 +47,7 @@ def build(  # noqa: PLR0913 - one argument per option
     images: ImagesOption = None,
     video: VideoOption = None,
     bag: BagOption = None,
-    out: Annotated[Path, typer.Option(help='The map bundle to write; replaced if it is one.')],
+    out: OutOption,
     camera: Annotated[
         str,
         typer.Option(
@@ -78,16 +78,8 @@ def build(  # noqa: PLR0913 - one argument per option
     metric: Annotated[
         bool, typer.Option(help='Whether one unit of the given poses is a metre.')
     ] = True,
-    descriptor_bits: Annotated[
-        int, typer.Option(help='Kept of each number of a local descriptor: 16, or 8.')
-    ] = 16,
-    discard_work: Annotated[
-        bool,
-        typer.Option(
-            '--discard-work',
-            help='Remove the folder OUT.work, with the finished steps, when the map is complete.',
-        ),
-    ] = False,
+    descriptor_bits: BitsOption = 16,
+    discard_work: DiscardOption = False,
     image_topic: ImageTopicOption = None,
     camera_info_topic: CameraInfoTopicOption = None,
     image_is_rectified: RectifiedOption = False,
@@ -99,7 +91,7 @@ def build(  # noqa: PLR0913 - one argument per option
     """Builds a map bundle from a folder of images, a video or a bag."""
     from gam_relocalizer.mapping.build import MapBuildOptions, build_map, check_output
     from gam_relocalizer.mapping.pictures import write_build_report
-    from gam_relocalizer.mapping.workspace import open_workspace, workspace_of
+    from gam_relocalizer.mapping.workspace import open_workspace, report_of, workspace_of
 
     sources = Sources(
         images=images,
@@ -133,38 +125,7 @@ def build(  # noqa: PLR0913 - one argument per option
             report = build_map(image_set, out, options, progress, workspace)
         if discard_work:
             workspace.discard()
-        _print_build(report, out, workspace)
+        print_build(report, out, workspace)
     if images is None:
         align_with(references, out)
-    write_build_report(out, report, out.with_name(f'{out.name}.report'))
-
-
-def _print_build(report: BuildReport, out: Path, workspace: Workspace) -> None:
-    left_out = {
-        'found no place': list(report.unregistered),
-        'could not be read': list(report.unreadable),
-        'have no pose': list(report.without_pose),
-    }
-    rows = {
-        'images in the map': f'{report.images_registered} of {report.images_given}',
-        'image pairs': f'{report.pairs_verified} of {report.pairs_matched} show the same thing',
-        'points': f'{report.points}',
-        'observations': f'{report.observations}, {report.mean_track_length:.1f} per point',
-        'mean reprojection error': f'{report.mean_reprojection_error:.2f} px',
-        **{f'images that {why}': some_of(names) for why, names in left_out.items() if names},
-        **{f'camera {i}': line for i, line in enumerate(report.cameras, start=1)},
-        'seconds': ', '.join(f'{step} {spent:.1f}' for step, spent in report.seconds.items()),
-    }
-    if report.other_models:
-        sizes = ', '.join(map(str, report.other_models))
-        rows['dropped models'] = f'separate pieces of {sizes} images'
-    if any(report.reused.values()):
-        rows['from the workspace'] = ', '.join(
-            f'{step} {count} {_UNITS[step]}' for step, count in report.reused.items() if count
-        )
-    if workspace.path.exists():
-        rows['workspace'] = (
-            f'{workspace.path.name}, {workspace.size / 2**20:.0f} MiB: finished steps, for a '
-            f'further build; may be deleted'
-        )
-    print_table(f'{out}', rows)
+    write_build_report(out, report, report_of(out))

@@ -9,7 +9,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gam_relocalizer.cli.map.printing import MapArgument, print_table, progress_bars, some_of
+from gam_relocalizer.cli.map.printing import (
+    MapArgument,
+    print_table,
+    print_warnings,
+    progress_bars,
+    some_of,
+)
+from gam_relocalizer.cli.map.sources import (
+    BagOption,
+    CameraInfoTopicOption,
+    ImagesOption,
+    ImageTopicOption,
+    RectifiedOption,
+    Sources,
+    VideoOption,
+    images_of,
+)
 from gam_relocalizer.cli.options import GlobalWeightsOption
 
 if TYPE_CHECKING:
@@ -20,13 +36,19 @@ if TYPE_CHECKING:
     from gam_relocalizer.mapping.prune import PruneReport
 
 OutOption = Annotated[
-    Path, typer.Option(help='The map bundle to write; replaced if it is one. May be the same.')
+    Path,
+    typer.Option(
+        help='The map bundle to write; replaced if it is one. May be the same.', resolve_path=True
+    ),
 ]
 
 
-def extend(
+def extend(  # noqa: PLR0913 - one argument per option
     path: MapArgument,
-    images: Annotated[Path, typer.Option(help='Folder of images, searched with sub-folders.')],
+    *,
+    images: ImagesOption = None,
+    video: VideoOption = None,
+    bag: BagOption = None,
     out: OutOption,
     camera: Annotated[
         str,
@@ -39,22 +61,41 @@ def extend(
         str, typer.Option(help='Put in front of the names of the images, for example `day2/`.')
     ] = '',
     global_weights: GlobalWeightsOption = None,
+    image_topic: ImageTopicOption = None,
+    camera_info_topic: CameraInfoTopicOption = None,
+    image_is_rectified: RectifiedOption = False,
 ) -> None:
     """Adds images to a map: another day, another light, another part. Nothing in it moves."""
-    from gam_relocalizer.cameras import parse_camera
-    from gam_relocalizer.image_set import ImageSet
+    from gam_relocalizer.mapping.build import check_output
     from gam_relocalizer.mapping.extend import extend_map
+    from gam_relocalizer.mapping.workspace import open_workspace, workspace_of
+    from gam_relocalizer.scene_map import read_manifest
 
-    image_set = ImageSet.of_folder(images, parse_camera(camera) if camera else None)
-    with progress_bars() as progress:
-        report = extend_map(
-            path,
-            image_set,
-            out,
-            prefix=prefix,
-            global_weights=global_weights,
-            progress=progress,
-        )
+    sources = Sources(
+        images=images,
+        video=video,
+        bag=bag,
+        camera=camera,
+        image_topic=image_topic,
+        camera_info_topic=camera_info_topic,
+        image_is_rectified=image_is_rectified,
+        aligns=False,
+    )
+    sources.check()
+    check_output(out)
+    read_manifest(path)  # before all of a video is read
+    # that of the map itself when it is extended in place: the keyframes of both have room there
+    with open_workspace(workspace_of(out)) as workspace:
+        image_set, _ = images_of(sources, workspace)
+        with progress_bars() as progress:
+            report = extend_map(
+                path,
+                image_set,
+                out,
+                prefix=prefix,
+                global_weights=global_weights,
+                progress=progress,
+            )
     _print_extension(report, out)
 
 
@@ -120,6 +161,7 @@ def _print_extension(report: ExtendReport, out: Path) -> None:
         'seconds': _seconds(report.seconds),
     }
     print_table(f'{out}', rows)
+    print_warnings(report.warnings)
 
 
 def _print_merger(report: MergeReport, out: Path) -> None:
@@ -135,8 +177,7 @@ def _print_merger(report: MergeReport, out: Path) -> None:
         'seconds': _seconds(report.seconds),
     }
     print_table(f'{out}', rows)
-    for warning in report.warnings:
-        typer.echo(f'warning: {warning}')
+    print_warnings(report.warnings)
 
 
 def _print_pruning(report: PruneReport, out: Path) -> None:

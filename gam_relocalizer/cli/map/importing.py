@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from gam_relocalizer.cli.map.printing import print_table, progress_bars, some_of
+from gam_relocalizer.cli.map.printing import (
+    BitsOption,
+    DiscardOption,
+    OutOption,
+    print_build,
+    progress_bars,
+)
 from gam_relocalizer.cli.options import GlobalWeightsOption
 from gam_relocalizer.datasets.layout import Layout, Split
 from gam_relocalizer.errors import UsageError
@@ -22,14 +28,13 @@ if TYPE_CHECKING:
     from gam_relocalizer.mapping.build import MapBuildOptions
     from gam_relocalizer.mapping.foreign_features import ForeignFeatures
     from gam_relocalizer.mapping.importing import ModelSummary
-    from gam_relocalizer.mapping.report import BuildReport
 
 
 def import_map(  # noqa: PLR0913 - one argument per option
     source: Annotated[
         Path, typer.Argument(help='A folder: a dataset, a COLMAP model or the sfm of hloc.')
     ],
-    out: Annotated[Path, typer.Option(help='The map bundle to write; replaced if it is one.')],
+    out: OutOption,
     *,
     images: Annotated[
         Path | None,
@@ -88,6 +93,8 @@ def import_map(  # noqa: PLR0913 - one argument per option
             'is not for a model.'
         ),
     ] = None,
+    descriptor_bits: BitsOption = 16,
+    discard_work: DiscardOption = False,
 ) -> None:
     """Makes a map bundle of a dataset with poses, a COLMAP model or an output of hloc."""
     from gam_relocalizer.mapping.build import MapBuildOptions
@@ -98,7 +105,8 @@ def import_map(  # noqa: PLR0913 - one argument per option
         import_model,
         import_model_with_features,
     )
-    from gam_relocalizer.mapping.workspace import open_workspace, workspace_of
+    from gam_relocalizer.mapping.pictures import write_build_report
+    from gam_relocalizer.mapping.workspace import open_workspace, report_of, workspace_of
 
     of_model = {'--images': images, '--database': database, '--features': features}
     of_dataset = {
@@ -113,6 +121,7 @@ def import_map(  # noqa: PLR0913 - one argument per option
         max_keypoints=max_keypoints,
         global_descriptor=global_descriptor,
         global_weights=global_weights,
+        descriptor_bits=descriptor_bits,
     )
     if not is_colmap_model(source):
         _refuse(of_model, f'{source}: not a COLMAP model (no images.bin or images.txt)')
@@ -123,30 +132,47 @@ def import_map(  # noqa: PLR0913 - one argument per option
             camera=_parsed(camera),
             metric=metric is not False,
         )
-        with open_workspace(workspace_of(out)) as workspace, progress_bars() as progress:
-            report = import_dataset(source, out, dataset, options, progress, workspace)
-        _print_import(report, None, out)
+        with open_workspace(workspace_of(out)) as workspace:
+            with progress_bars() as progress:
+                report = import_dataset(source, out, dataset, options, progress, workspace)
+            if discard_work:
+                workspace.discard()
+            print_build(report, out, workspace)
+        write_build_report(out, report, report_of(out))
         return
     _refuse(of_dataset, f'{source}: a COLMAP model, which has cameras and poses of its own')
     _check_one_given(of_model, source)
     if images is not None:
-        with open_workspace(workspace_of(out)) as workspace, progress_bars() as progress:
-            report, model = import_model(
-                source,
-                images,
-                out,
-                options,
-                metric=bool(metric),
-                progress=progress,
-                workspace=workspace,
-            )
+        with open_workspace(workspace_of(out)) as workspace:
+            with progress_bars() as progress:
+                report, model = import_model(
+                    source,
+                    images,
+                    out,
+                    options,
+                    metric=bool(metric),
+                    progress=progress,
+                    workspace=workspace,
+                )
+            if discard_work:
+                workspace.discard()
+            print_build(report, out, workspace, _of_model(model))
     else:
+        if discard_work:
+            msg = '--discard-work: an import that reads no images leaves no work; leave it out'
+            raise UsageError(msg)
         found = _foreign_features(database, features, extractor, options)
         with progress_bars() as progress:
             report, model = import_model_with_features(
-                source, found, out, metric=bool(metric), progress=progress
+                source,
+                found,
+                out,
+                metric=bool(metric),
+                descriptor_bits=descriptor_bits,
+                progress=progress,
             )
-    _print_import(report, model, out)
+        print_build(report, out, None, _of_model(model))
+    write_build_report(out, report, report_of(out))
 
 
 def _parsed(camera: str) -> pycolmap.Camera | None:
@@ -187,7 +213,10 @@ def _foreign_features(
     from gam_relocalizer.mapping.build import MapBuildOptions
     from gam_relocalizer.mapping.foreign_features import SIFT, DatabaseFeatures, HlocFeatures
 
-    if options != MapBuildOptions(extractor=options.extractor):
+    of_no_image = MapBuildOptions(
+        extractor=options.extractor, descriptor_bits=options.descriptor_bits
+    )
+    if options != of_no_image:
         msg = (
             '--max-keypoints, --global, --global-weights and --refine-camera are about images that '
             'are read, and here none are; leave them out'
@@ -204,31 +233,8 @@ def _foreign_features(
     return HlocFeatures(features, extractor)
 
 
-def _print_import(report: BuildReport, model: ModelSummary | None, out: Path) -> None:
-    from gam_relocalizer.mapping.workspace import workspace_of
-
-    left_out = {
-        'found no place': list(report.unregistered),
-        'could not be read': list(report.unreadable),
-        'have no pose': list(report.without_pose),
-    }
-    rows = {
-        'images in the map': f'{report.images_registered} of {report.images_given}',
-        'points': f'{report.points}',
-        'observations': f'{report.observations}, {report.mean_track_length:.1f} per point',
-        'mean reprojection error': f'{report.mean_reprojection_error:.2f} px',
-        **{f'images that {why}': some_of(names) for why, names in left_out.items() if names},
-        **{f'camera {i}': line for i, line in enumerate(report.cameras, start=1)},
-        'seconds': ', '.join(f'{step} {spent:.1f}' for step, spent in report.seconds.items()),
-    }
-    workspace = workspace_of(out)
-    if workspace.exists():
-        rows['workspace'] = (
-            f'{workspace.name}: finished steps, for a further import; may be deleted'
-        )
-    if model is not None:
-        error = model.mean_reprojection_error
-        rows['the model had'] = f'{model.images} images, {model.points} points' + (
-            f', {error:.2f} px' if error is not None else ''
-        )
-    print_table(f'{out}', rows)
+def _of_model(model: ModelSummary) -> dict[str, str]:
+    """What there was before the import, as a row."""
+    error = model.mean_reprojection_error
+    fits = f', {error:.2f} px' if error is not None else ''
+    return {'the model had': f'{model.images} images, {model.points} points{fits}'}

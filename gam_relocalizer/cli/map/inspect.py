@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from gam_relocalizer.cli.map.outputs import check_folder_to_write
 from gam_relocalizer.cli.map.printing import MapArgument, print_table, progress_bars, some_of
 from gam_relocalizer.cli.options import GlobalWeightsOption
 
@@ -84,9 +85,11 @@ def check(
     from gam_relocalizer.errors import UsageError
     from gam_relocalizer.mapping.check import check_map
 
-    if out is not None and out.exists() and not out.is_dir():
-        msg = f'{out}: is not a folder; give another place with --out'
+    if images is None and (every != 1 or global_weights is not None):
+        msg = f'{"--every" if every != 1 else "--global-weights"} needs --images'
         raise UsageError(msg)
+    if out is not None:
+        check_folder_to_write(out, '--out')
     report = check_map(path)
     if images is not None and report.loadable:
         report = _with_coverage(report, path, images, every, global_weights)
@@ -157,7 +160,7 @@ def _print_manifest(manifest: Manifest, bounds: Mapping[str, Any], path: Path) -
         'size': f'{sum(entry.size for entry in manifest.files.values()) / 2**20:.1f} MiB',
         'bytes per point': f'{bytes_of[RUN_TIME]:.1f} at run time, {bytes_of[SFM]:.1f} {SFM}/',
         'largest files': ', '.join(f'{name} {size:.1f}' for name, size in largest),
-        **{f'option {name}': value for name, value in options.items() if name != 'cameras'},
+        **{f'option {name}': value for name, value in options.items() if _is_told(name, value)},
         **_camera_rows(cameras if isinstance(cameras, (list, tuple)) else ()),
         **({} if mean_error is None else {'mean reprojection error': f'{mean_error:.2f} px'}),
         **_change_rows(manifest.build.get('changes')),
@@ -183,6 +186,11 @@ def _alignment_rows(alignment: Mapping[str, Any]) -> dict[str, str]:
     return rows
 
 
+def _is_told(name: str, value: object) -> bool:
+    """Whether an option of the build is worth a row: cameras have rows of their own."""
+    return name != 'cameras' and value is not None
+
+
 def _camera_rows(cameras: list[Any] | tuple[Any, ...]) -> dict[str, object]:
     return {f'camera {number}': line for number, line in enumerate(cameras, start=1)}
 
@@ -193,7 +201,11 @@ def _change_rows(changes: object) -> dict[str, str]:
     rows = {}
     for number, step in enumerate(steps, start=1):
         words = step.items() if isinstance(step, dict) else [('', step)]
-        simple = [(name, value) for name, value in words if isinstance(value, (str, int, float))]
+        simple = [
+            (name, value)
+            for name, value in words
+            if isinstance(value, (str, int, float)) and value != ''
+        ]
         rows[f'change {number}'] = ', '.join(f'{name} {value}'.strip() for name, value in simple)
     return rows
 

@@ -1,6 +1,6 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""What `map build` does with videos and bags: keyframes before the build, alignment after it."""
+"""Where `map build` and `map extend` take images from, and what a new map is aligned with."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from gam_relocalizer.cli.map.align import print_report
-from gam_relocalizer.cli.map.printing import print_table, progress_bars
+from gam_relocalizer.cli.map.printing import print_table, print_warnings, progress_bars
 from gam_relocalizer.errors import AlignmentError, UsageError
 
 if TYPE_CHECKING:
@@ -34,8 +34,8 @@ BagOption = Annotated[
     Path | None,
     typer.Option(
         '--bag',
-        help='A rosbag2: its directory, or one .mcap or .db3 file. Keyframes are chosen, and the '
-        'map is aligned with odometry, GPS or transforms that the bag holds.',
+        help='A rosbag2: its directory, or one .mcap or .db3 file. Keyframes are chosen; a new map '
+        'is aligned with odometry, GPS or transforms that the bag holds.',
     ),
 ]
 ImageTopicOption = Annotated[
@@ -79,21 +79,25 @@ CameraFrameOption = Annotated[
 
 @dataclass(frozen=True)
 class Sources:
-    """The options that say what to build a map from; None where they were not given."""
+    """The options that say what to build a map from; None where they were not given.
+
+    With `aligns` the places in a bag where images were taken are read; else they are left alone.
+    """
 
     images: Path | None
     video: Path | None
     bag: Path | None
     camera: str
-    poses: Path | None
-    metric: bool
     image_topic: str | None
     camera_info_topic: str | None
     image_is_rectified: bool
-    odom_topic: str | None
-    gps_topic: str | None
-    base_frame: str | None
-    camera_frame: str | None
+    poses: Path | None = None
+    metric: bool = True
+    odom_topic: str | None = None
+    gps_topic: str | None = None
+    base_frame: str | None = None
+    camera_frame: str | None = None
+    aligns: bool = True
 
     def check(self) -> None:
         """Makes sure that the options go together.
@@ -105,7 +109,7 @@ class Sources:
         given = [option for option, value in sources.items() if value is not None]
         if len(given) != 1:
             found = ' and '.join(given) or 'none of them'
-            msg = f'give one of {", ".join(sources)}, to build the map from; found {found}'
+            msg = f'give one of {", ".join(sources)}, to take images from; found {found}'
             raise UsageError(msg)
         of_bags = {
             '--image-topic': self.image_topic,
@@ -124,7 +128,7 @@ class Sources:
 
 
 def images_of(sources: Sources, workspace: Workspace) -> tuple[ImageSet, tuple[Reference, ...]]:
-    """What to build the map from, and what to align it with; says what became of frames."""
+    """The images, and what to align a map of them with; says what became of frames."""
     from gam_relocalizer.cameras import parse_camera
     from gam_relocalizer.geometry import read_poses
     from gam_relocalizer.image_set import ImageSet
@@ -149,17 +153,18 @@ def _capture(
     from gam_relocalizer.capture.recording import BagOptions, capture_bag
     from gam_relocalizer.capture.whereabouts import BASE_FRAME, WhereaboutsTopics
 
+    whereabouts = WhereaboutsTopics(
+        odometry=sources.odom_topic,
+        gps=sources.gps_topic,
+        camera_frame=sources.camera_frame,
+        base_frame=BASE_FRAME if sources.base_frame is None else sources.base_frame,
+    )
     options = BagOptions(
         image_topic=sources.image_topic,
         camera_info_topic=sources.camera_info_topic,
         camera=camera,
         image_is_rectified=sources.image_is_rectified,
-        whereabouts=WhereaboutsTopics(
-            odometry=sources.odom_topic,
-            gps=sources.gps_topic,
-            camera_frame=sources.camera_frame,
-            base_frame=BASE_FRAME if sources.base_frame is None else sources.base_frame,
-        ),
+        whereabouts=whereabouts if sources.aligns else None,
     )
     return capture_bag(cast('Path', sources.bag), workspace, options, progress)
 
@@ -175,8 +180,8 @@ def _print_capture(capture: Capture) -> None:
         'keyframes': f'{counts.chosen}',
     }
     print_table(capture.name, rows)
-    for warning in capture.warnings:
-        typer.echo(f'warning: {warning}')
+    typer.echo(f'keyframes in {capture.images.folder}')  # a table would break the path
+    print_warnings(capture.warnings)
 
 
 def align_with(references: Sequence[Reference], out: Path) -> None:

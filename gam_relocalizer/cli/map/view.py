@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from gam_relocalizer.cli.map.outputs import check_file_to_write
 from gam_relocalizer.cli.map.printing import MapArgument
 
 
@@ -26,7 +27,7 @@ def view(
 ) -> None:
     """Shows a map in 3D with rerun: points, cameras, covisibility, and a replayed drive.
 
-    Needs `pip install gam_relocalizer[view]`. Nothing leaves this machine.
+    Needs rerun, the extra `view` of the package. Nothing leaves this machine.
     """
     from gam_relocalizer.scene_map import load_map
     from gam_relocalizer.viewing.drive import read_drive
@@ -34,6 +35,8 @@ def view(
     from gam_relocalizer.viewing.viewer import show
 
     import_rerun()  # before the work, and not after it
+    if save is not None:
+        check_file_to_write(save, '--save')
     scene_map = load_map(path)
     drive = None if replay is None else read_drive(replay)
     if drive is not None and drive.map_id != scene_map.manifest.map_id:
