@@ -67,8 +67,15 @@ def main() -> None:
     try:
         app()
     except RelocalizerError as err:
-        Console(stderr=True).print(f'error: {err}', style='red', markup=False, soft_wrap=True)
+        _print_error(str(err))
         sys.exit(EXIT_USAGE if isinstance(err, UsageError) else EXIT_FAILURE)
+    except OSError as err:  # a full disk, a folder that may not be written to
+        _print_error(f'{err.filename}: {err.strerror}' if err.filename else str(err))
+        sys.exit(EXIT_FAILURE)
+
+
+def _print_error(text: str) -> None:
+    Console(stderr=True).print(f'error: {text}', style='red', markup=False, soft_wrap=True)
 
 
 if __name__ == '__main__':

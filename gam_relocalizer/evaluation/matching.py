@@ -17,7 +17,8 @@ import numpy as np
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.geometry import PoseError, pose_error
 from gam_relocalizer.localization.pose import estimate_pose, reprojection_errors
-from gam_relocalizer.mapping.leave_one_out import NO_POINT, leave_out
+from gam_relocalizer.mapping.colmap_model import NO_POINT
+from gam_relocalizer.mapping.leave_one_out import leave_out
 from gam_relocalizer.mapping.progress import ignore_progress
 from gam_relocalizer.matching.bmnet import normalise_keypoints, normalised_focal_length
 from gam_relocalizer.matching.candidates import knn_ratio

@@ -43,7 +43,7 @@ from gam_relocalizer.scene_map import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path
+    from pathlib import Path, PurePosixPath
 
     from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor
@@ -112,6 +112,7 @@ def build_map(
     """
     options = options or MapBuildOptions()
     check_output(out)
+    check_apart(out, images.folder)
     _check_options(options)
     extractor = create_extractor(options.extractor, options.max_keypoints)
     describer = load_global_descriptor(options.global_descriptor, options.global_weights)
@@ -122,7 +123,7 @@ def build_map(
         steps = Steps(used, progress)
         extraction = Extraction(extractor, options.max_keypoints, describer)
         extracted = steps.extract(images.folder, wanted, extraction)
-        _check_usable(extracted, images.folder)
+        _check_usable(extracted, images.source)
         cameras = assign_cameras(images, extracted.images)
         retrieval = steps.describe(extracted.images, learn_words=describer is None)
         matched = Matched(
@@ -182,8 +183,26 @@ def check_output(out: Path) -> None:
         raise MapError(msg)
 
 
+def check_apart(out: Path, images: Path) -> None:
+    """Refuses to write a map among images: its pictures would be taken for some of them.
+
+    Raises:
+        UsageError: The map is to lie in the folder of images.
+    """
+    if out.resolve().is_relative_to(images.resolve()):
+        msg = (
+            f'{out}: lies in the folder of images, {images}, where the pictures that a build '
+            f'leaves would be taken for images; choose a place outside of it'
+        )
+        raise UsageError(msg)
+
+
 def check_names(names: Sequence[str]) -> None:
-    """Refuses names that a line of a poses file cannot hold."""
+    """Refuses names that a line of a poses file cannot hold, or that lead out of their folder.
+
+    Raises:
+        UsageError: The first such name.
+    """
     for name in names:
         encodable = name.encode('utf-8', errors='ignore').decode() == name
         if not encodable or len(name.splitlines()) != 1 or name.lstrip().startswith('#'):
@@ -191,6 +210,9 @@ def check_names(names: Sequence[str]) -> None:
                 f'image {name!r}: rename it; a name may not begin with #, nor hold a line break or '
                 f'bytes that are not UTF-8'
             )
+            raise UsageError(msg)
+        if PurePosixPath(name).is_absolute() or '..' in PurePosixPath(name).parts:
+            msg = f'image {name!r}: the name leads out of the folder of images; it may hold no `..`'
             raise UsageError(msg)
 
 
@@ -208,11 +230,11 @@ def _with_pose(given: Sequence[str], poses: Mapping[str, pycolmap.Rigid3d] | Non
     return wanted
 
 
-def _check_usable(extracted: ExtractionResult, folder: Path) -> None:
+def _check_usable(extracted: ExtractionResult, source: str) -> None:
     usable = extracted.num_usable
     if usable < MIN_IMAGES:
         msg = (
-            f'{folder}: {usable} images can be used, a map needs at least {MIN_IMAGES}: '
+            f'{source}: {usable} of its images can be used, a map needs at least {MIN_IMAGES}: '
             f'{len(extracted.unreadable)} could not be read, '
             f'{len(extracted.images) - usable} show nothing that can be recognised'
         )

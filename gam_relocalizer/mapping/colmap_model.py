@@ -22,13 +22,15 @@ import pycolmap
 from gam_relocalizer.cameras import parse_camera
 from gam_relocalizer.errors import CameraError, ModelError
 from gam_relocalizer.geometry import rigid3d_from
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
     from numpy.typing import NDArray
+
+NO_POINT = -1
+"""In place of a point, for a keypoint that observes none."""
 
 _FILES = ('cameras', 'images', 'points3D')
 _SUFFIXES = ('.bin', '.txt')

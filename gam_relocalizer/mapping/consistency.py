@@ -15,7 +15,7 @@ import numpy as np
 
 from gam_relocalizer.errors import MapError
 from gam_relocalizer.geometry import pose_error
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.mapping.mapped_images import read_model_of
 from gam_relocalizer.scene_map import SFM, covisibility_of
 

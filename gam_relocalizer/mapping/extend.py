@@ -20,7 +20,7 @@ from gam_relocalizer.features.registry import (
     create_extractor,
     global_descriptor_of,
 )
-from gam_relocalizer.mapping.build import check_names, check_output, save_bundle
+from gam_relocalizer.mapping.build import check_apart, check_names, check_output, save_bundle
 from gam_relocalizer.mapping.extraction import extract_images
 from gam_relocalizer.mapping.intrinsics import assign_cameras
 from gam_relocalizer.mapping.mapped_images import (
@@ -124,6 +124,7 @@ def extend_map(
         MapBuildError: No image finds a place in the map.
     """
     check_output(out)
+    check_apart(out, images.folder)
     scene_map = load_map(path)
     names = [f'{prefix}{name}' for name in images.names]
     check_names(names)

@@ -27,10 +27,9 @@ from gam_relocalizer.mapping.build import (
     check_output,
     save_bundle,
 )
-from gam_relocalizer.mapping.colmap_model import read_colmap_model
+from gam_relocalizer.mapping.colmap_model import NO_POINT, read_colmap_model
 from gam_relocalizer.mapping.extraction import MappingImage
 from gam_relocalizer.mapping.intrinsics import assign_cameras
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
 from gam_relocalizer.mapping.mapped_images import assemble, content_of
 from gam_relocalizer.mapping.progress import StepTimer, ignore_progress
 from gam_relocalizer.mapping.report import BuildReport

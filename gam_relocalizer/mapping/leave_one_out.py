@@ -20,6 +20,8 @@ from gam_relocalizer.errors import ImageError, MapError, UsageError
 from gam_relocalizer.features.registry import create_extractor
 from gam_relocalizer.images import read_image
 from gam_relocalizer.map_encoding import unit_rows
+from gam_relocalizer.mapping.colmap_model import NO_POINT
+from gam_relocalizer.mapping.mapped_images import images_in_order, read_model_of
 from gam_relocalizer.mapping.progress import ignore_progress
 from gam_relocalizer.scene_map import SceneMap
 
@@ -33,7 +35,6 @@ if TYPE_CHECKING:
     from gam_relocalizer.features.local import LocalExtractor
     from gam_relocalizer.mapping.progress import Progress
 
-NO_POINT = -1
 # Keypoints of the same image and extractor agree to rounding, but for a few of the faintest.
 _SAME_KEYPOINT_PX = 0.01
 _MIN_KNOWN_KEYPOINTS = 0.9
@@ -289,9 +290,6 @@ class _ObservedImage:
 
 def _read_observed_images(scene_map: SceneMap) -> list[_ObservedImage]:
     """The map's images, in its order."""
-    # these rooms take NO_POINT from here
-    from gam_relocalizer.mapping.mapped_images import images_in_order, read_model_of
-
     model = read_model_of(scene_map.path, scene_map.manifest)
     images = images_in_order(model, scene_map.image_names, scene_map.num_points)
     return [

@@ -18,11 +18,10 @@ import pycolmap
 from gam_relocalizer.cameras import format_camera
 from gam_relocalizer.errors import MapError, ModelError, UsageError
 from gam_relocalizer.features.local import LocalFeatures
-from gam_relocalizer.mapping.colmap_model import read_colmap_model
+from gam_relocalizer.mapping.colmap_model import NO_POINT, read_colmap_model
 from gam_relocalizer.mapping.descriptors import describe_points
 from gam_relocalizer.mapping.extraction import MappingImage
 from gam_relocalizer.mapping.intrinsics import ImageCameras
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
 from gam_relocalizer.mapping.sfm import image_id_of
 from gam_relocalizer.scene_map import SFM, MapContent, load_content, verify_files
 

@@ -13,8 +13,8 @@ import pycolmap
 
 from gam_relocalizer.errors import MapBuildError, MapError
 from gam_relocalizer.features.vlad import RETRIEVAL_NAME, Vlad
-from gam_relocalizer.mapping.build import check_names, check_output
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
+from gam_relocalizer.mapping.build import check_names, check_output, save_bundle
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.mapping.mapped_images import (
     assemble,
     changed_manifest,
@@ -35,7 +35,6 @@ from gam_relocalizer.mapping.sfm import (
     quiet_colmap,
     verify_pairs,
 )
-from gam_relocalizer.scene_map import save_map
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -155,7 +154,7 @@ def merge_maps(
         'median_distance': unit * laid.median_distance,
         'scale': scale,
     }
-    save_map(out, content, changed_manifest(first.manifest, change, model), model)
+    save_bundle(out, content, changed_manifest(first.manifest, change, model), model)
     progress('save', 1, 1)
     return MergeReport(
         images=(len(first.images), len(second.images)),

@@ -16,9 +16,10 @@ from gam_relocalizer.features.local import LocalFeatures
 from gam_relocalizer.features.registry import global_descriptor_of
 from gam_relocalizer.geometry import pose_error
 from gam_relocalizer.images import read_image
-from gam_relocalizer.mapping.build import check_output
+from gam_relocalizer.mapping.build import check_output, save_bundle
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.mapping.coverage import tolerance_of
-from gam_relocalizer.mapping.leave_one_out import NO_POINT, map_without, read_reference_images
+from gam_relocalizer.mapping.leave_one_out import map_without, read_reference_images
 from gam_relocalizer.mapping.mapped_images import (
     assemble,
     changed_manifest,
@@ -145,7 +146,7 @@ def prune_map(
     )
     change = {'what': 'prune', 'keep': keep, **asdict(report)}
     progress('save', 0, 1)
-    save_map(out, content, changed_manifest(manifest, change, model), model)
+    save_bundle(out, content, changed_manifest(manifest, change, model), model)
     progress('save', 1, 1)
     return report
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gam_relocalizer.cameras import have_known_rays
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.matching.bmnet import normalise_keypoints, normalised_focal_length
 from gam_relocalizer.training.labelled import meet
 

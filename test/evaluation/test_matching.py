@@ -30,12 +30,8 @@ from gam_relocalizer.evaluation.matching import (
     summarise,
 )
 from gam_relocalizer.geometry import rigid3d_from
-from gam_relocalizer.mapping.leave_one_out import (
-    NO_POINT,
-    ReferenceImage,
-    ReferenceImages,
-    leave_out,
-)
+from gam_relocalizer.mapping.colmap_model import NO_POINT
+from gam_relocalizer.mapping.leave_one_out import ReferenceImage, ReferenceImages, leave_out
 from gam_relocalizer.matching.baselines import NearestNeighbourCross
 from gam_relocalizer.matching.matcher import Matches, MatchInput
 from gam_relocalizer.scene_map import (

@@ -377,6 +377,14 @@ def test_output_that_is_no_map_is_refused_before_any_work(room: Room, tmp_path: 
     assert steps == []
 
 
+def test_output_among_the_images_is_refused(room: Room, tmp_path: Path) -> None:
+    shutil.copytree(room.images, tmp_path / 'images')
+
+    with pytest.raises(UsageError, match='outside'):
+        build_map(ImageSet.of_folder(tmp_path / 'images'), tmp_path / 'images' / 'map')
+    assert not (tmp_path / 'images' / 'map').exists()
+
+
 def test_output_below_a_file_is_refused(room: Room, tmp_path: Path) -> None:
     (tmp_path / 'file').touch()
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from gam_relocalizer.cameras import CAMERA_MODELS, format_camera
 from gam_relocalizer.errors import ModelError
-from gam_relocalizer.mapping.colmap_model import ColmapModel, read_colmap_model
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
+from gam_relocalizer.mapping.colmap_model import NO_POINT, ColmapModel, read_colmap_model
 from gam_relocalizer.mapping.sfm import quiet_colmap
 
 if TYPE_CHECKING:

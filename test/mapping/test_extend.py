@@ -221,3 +221,15 @@ def test_map_of_other_weights_is_refused(extended: Extended, tmp_path: Path) -> 
 
     with pytest.raises(MapError, match='extractor'):
         extend_map(path, ImageSet.of_folder(extended.added, CAMERA), tmp_path / 'new')
+
+
+def test_names_that_lead_out_of_the_folder_are_refused(
+    posed_map: BuiltMap, room: Room, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match='leads out'):
+        extend_map(
+            posed_map.path,
+            ImageSet.of_folder(room.images, CAMERA),
+            tmp_path / 'map',
+            prefix='../x/',
+        )

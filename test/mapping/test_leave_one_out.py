@@ -20,8 +20,8 @@ from map_content import all_global_descriptors
 from gam_relocalizer.errors import ImageError, MapError, UsageError
 from gam_relocalizer.geometry import rigid3d_from
 from gam_relocalizer.localization.pose import reprojection_errors
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.mapping.leave_one_out import (
-    NO_POINT,
     ReferenceImage,
     ReferenceImages,
     _same_keypoints,

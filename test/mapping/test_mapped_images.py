@@ -8,8 +8,8 @@ import numpy as np
 from corner_room import CAMERA
 
 from gam_relocalizer.cameras import parse_camera
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.mapping.intrinsics import ImageCameras
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
 from gam_relocalizer.mapping.mapped_images import (
     assemble,
     content_of,

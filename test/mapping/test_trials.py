@@ -12,9 +12,9 @@ import pytest
 
 from gam_relocalizer.errors import UsageError
 from gam_relocalizer.geometry import rigid3d_from
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.mapping.coverage import Standing
 from gam_relocalizer.mapping.leave_one_out import (
-    NO_POINT,
     ReferenceImages,
     map_without,
     read_reference_images,

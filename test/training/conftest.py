@@ -9,7 +9,8 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gam_relocalizer.mapping.leave_one_out import NO_POINT, ReferenceImage, ReferenceImages
+from gam_relocalizer.mapping.colmap_model import NO_POINT
+from gam_relocalizer.mapping.leave_one_out import ReferenceImage, ReferenceImages
 from gam_relocalizer.scene_map import (
     ExtractorIdentity,
     FileEntry,

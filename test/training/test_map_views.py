@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from map_content import changed_map, of_first_images, with_points
 
 from gam_relocalizer.cameras import have_known_rays
-from gam_relocalizer.mapping.leave_one_out import NO_POINT
+from gam_relocalizer.mapping.colmap_model import NO_POINT
 from gam_relocalizer.matching.bmnet import normalise_keypoints
 from gam_relocalizer.training.labelled import TRUE_ERROR
 from gam_relocalizer.training.map_views import FEWEST_KEYPOINTS, MapView, map_view
