@@ -7,6 +7,7 @@ from __future__ import annotations
 import os
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +44,7 @@ from gam_relocalizer.scene_map import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-    from pathlib import Path, PurePosixPath
+    from pathlib import Path
 
     from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor
