@@ -35,7 +35,11 @@ class StrictLoader(yaml.SafeLoader):
 
 def read_yaml(name: str) -> Any:  # noqa: ANN401 - whatever the file holds
     text = (REPOSITORY / 'config' / name).read_text(encoding='utf-8')
-    return yaml.load(text, StrictLoader)  # noqa: S506 - a safe loader
+    loader = StrictLoader(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
 
 
 @pytest.fixture(scope='session')
