@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from gam_relocalizer.localization.prior import Prior
     from gam_relocalizer.localization.result import LocalizationResult, Timings
 
-STAGES = ('extraction', 'retrieval', 'matching', 'pose', 'total')
+STAGES = ('extraction', 'retrieval', 'matching', 'pose', 'verdict', 'total')
 
 
 @dataclass(frozen=True)

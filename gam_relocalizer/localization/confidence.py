@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,8 +82,13 @@ def nearness(covariance: NDArray[np.float64]) -> float:
     Args:
         covariance: [6,6] of the pose, order of REP-103.
     """
-    draws = np.random.default_rng(0).standard_normal((_SAMPLES, 6))
-    errors = draws @ np.linalg.cholesky(covariance).T
+    errors = _draws() @ np.linalg.cholesky(covariance).T
     near = np.linalg.norm(errors[:, :3], axis=1) <= NEAR_POSITION
     near &= np.linalg.norm(errors[:, 3:], axis=1) <= math.radians(NEAR_ROTATION_DEG)
     return float(np.mean(near))
+
+
+@cache
+def _draws() -> NDArray[np.float64]:
+    """[S,6] of a normal distribution of unit variance, always the same."""
+    return np.random.default_rng(0).standard_normal((_SAMPLES, 6))

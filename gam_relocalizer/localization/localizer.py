@@ -40,7 +40,7 @@ from gam_relocalizer.localization.result import (
     Timings,
 )
 from gam_relocalizer.localization.retrieval import retrieve
-from gam_relocalizer.localization.scenes import Coarse, orientation_kept
+from gam_relocalizer.localization.scenes import Coarse, distinct, orientation_kept
 from gam_relocalizer.localization.search import candidates, search
 from gam_relocalizer.localization.support import support_of
 from gam_relocalizer.localization.verdict import (
@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor, LocalFeatures
     from gam_relocalizer.localization.look_alikes import LookAlike
+    from gam_relocalizer.localization.pose import AbsolutePose
     from gam_relocalizer.localization.scenes import Scene
     from gam_relocalizer.localization.search import Candidate
     from gam_relocalizer.localization.verdict import Verdict
@@ -186,7 +187,7 @@ class Localizer:
         result = self._localize_query(query)
         if not result.accepted:
             return result
-        with clock.stage('extraction'):
+        with clock.stage('verdict'):
             verdict = self._judge_mirrored(image, described)
         if verdict is not None:
             result = result.judged(verdict.status, verdict.reason)
@@ -275,7 +276,7 @@ class Localizer:
         name = self._scene_map.image_names[scene.image]
         result = LocalizationResult(
             Status.TOO_FEW_MATCHES,
-            matches=len(np.unique(matches.keypoint_indices)),
+            matches=len(distinct(matches.keypoint_indices)),
             scene=name,
         )
         needed = max(MIN_MATCHES, self._options.verdict.min_inliers)
@@ -283,13 +284,14 @@ class Localizer:
             reason = f'{result.matches} matches with the scene around `{name}`, needs {needed}'
             return replace(result, reason=reason)
         with query.clock.stage('pose'):
-            estimate = self._estimate(matches, scene, query)
-        if estimate is None:
+            pose = self._pose(matches, scene, query)
+        if pose is None:
             reason = f'the {result.matches} matches with the scene around `{name}` fit no pose'
             return replace(result, status=Status.NO_POSE, reason=reason)
-        with query.clock.stage('pose'):
+        with query.clock.stage('verdict'):
+            estimate = self._estimate(pose, matches, scene, query)
             verdict = self._judge(estimate, scene, query)
-        confidence = estimate.belief * nearness(estimate.covariance)
+            confidence = estimate.belief * nearness(estimate.covariance)
         found = replace(result, estimate=estimate, confidence=confidence)
         return found.judged(verdict.status, verdict.reason)
 
@@ -338,27 +340,31 @@ class Localizer:
         )
         return self._matcher.match(given)
 
-    def _estimate(self, matches: Matches, scene: Scene, query: _Query) -> PoseEstimate | None:
-        """The pose of matches between features and points of a scene, and what speaks for it."""
-        camera = query.camera
-        keypoints = query.features.keypoints[matches.keypoint_indices]
+    def _pose(self, matches: Matches, scene: Scene, query: _Query) -> AbsolutePose | None:
+        """The pose of matches between features and points of a scene."""
         points = scene.points[matches.point_indices]
-        pose = estimate_pose(
-            keypoints,
+        return estimate_pose(
+            query.features.keypoints[matches.keypoint_indices],
             self._scene_map.positions_of(points),
             matches.weights,
-            camera,
+            query.camera,
             self._options.pose,
             matches.nearest,
             point_covariances(self._scene_map, points, scene.images),
         )
-        if pose is None:
-            return None
-        inlier_keypoints, inlier_points = keypoints[pose.inliers], points[pose.inliers]
+
+    def _estimate(
+        self, pose: AbsolutePose, matches: Matches, scene: Scene, query: _Query
+    ) -> PoseEstimate:
+        """A pose of matches, and what speaks for it."""
+        camera = query.camera
+        features = matches.keypoint_indices[pose.inliers]
+        keypoints = query.features.keypoints[features]
+        points = scene.points[matches.point_indices[pose.inliers]]
         support = support_of(
-            pose.camera_from_map, camera, inlier_keypoints, inlier_points, scene, self._scene_map
+            pose.camera_from_map, camera, keypoints, points, scene, self._scene_map
         )
-        coverage = coverage_of(inlier_keypoints, camera)
+        coverage = coverage_of(keypoints, camera)
         error = float(np.sqrt(np.mean(np.square(pose.errors[pose.inliers]))))
         residual = scaled_residual(error, max(camera.width, camera.height))
         belief = belief_in(Evidence(coverage, residual, support.unmatched))
@@ -368,10 +374,10 @@ class Localizer:
         return PoseEstimate(
             camera_from_map=pose.camera_from_map,
             covariance=pose.covariance,
-            inlier_keypoints=inlier_keypoints,
-            inlier_features=matches.keypoint_indices[pose.inliers],
-            inlier_points=inlier_points,
-            inlier_ratio=len(inlier_keypoints) / len(np.unique(matches.keypoint_indices)),
+            inlier_keypoints=keypoints,
+            inlier_features=features,
+            inlier_points=points,
+            inlier_ratio=len(points) / len(distinct(matches.keypoint_indices)),
             coverage=coverage,
             reprojection_error=error,
             support=support,

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gam_relocalizer.localization.pose import MIN_MATCHES, estimate_pose, reprojection_errors
-from gam_relocalizer.localization.scenes import most_covisible
+from gam_relocalizer.localization.pose import estimate_pose, reprojection_errors
+from gam_relocalizer.localization.scenes import distinct, most_covisible
+from gam_relocalizer.localization.verdict import are_many_look_alikes
 from gam_relocalizer.matching.candidates import knn_ratio
 
 if TYPE_CHECKING:
@@ -42,12 +43,17 @@ class LookAlike:
     Attributes:
         camera_from_map: The pose.
         agreeing: Keypoints of the inliers that agree with it as well.
-        share: Of those that were asked, 0 to 1.
+        asked: Of so many.
     """
 
     camera_from_map: pycolmap.Rigid3d
     agreeing: int
-    share: float
+    asked: int
+
+    @property
+    def share(self) -> float:
+        """Agreeing ones per asked one, 0 to 1."""
+        return self.agreeing / self.asked
 
 
 def look_alike_of(
@@ -59,7 +65,7 @@ def look_alike_of(
     scene_map: SceneMap,
     options: PoseOptions,
 ) -> LookAlike | None:
-    """Searches a pose from what the inliers look like elsewhere.
+    """Searches a pose from what the inliers look like elsewhere, if enough do to matter.
 
     Args:
         camera_from_map: The pose in question.
@@ -80,7 +86,8 @@ def look_alike_of(
     places = scene_map.positions_of(points[alike.edges[:, 1]])
     errors = reprojection_errors(camera_from_map, keypoints, places, camera)
     elsewhere = errors > _APART * options.threshold_px(camera)
-    if np.count_nonzero(elsewhere) < MIN_MATCHES:
+    # no keypoint agrees with a pose twice
+    if not are_many_look_alikes(len(distinct(alike.edges[elsewhere, 0])), len(chosen)):
         return None
     found = estimate_pose(
         keypoints[elsewhere], places[elsewhere], -alike.distances[elsewhere], camera, options
@@ -88,7 +95,7 @@ def look_alike_of(
     if found is None:
         return None
     agreeing = int(np.count_nonzero(found.inliers))
-    return LookAlike(found.camera_from_map, agreeing, agreeing / len(chosen))
+    return LookAlike(found.camera_from_map, agreeing, len(chosen))
 
 
 def points_around(images: Iterable[int], scene_map: SceneMap, size: int) -> NDArray[np.int64]:
@@ -100,5 +107,5 @@ def points_around(images: Iterable[int], scene_map: SceneMap, size: int) -> NDAr
         size: Most images in one scene.
     """
     covisible = [most_covisible(image, scene_map, size) for image in images]
-    seen = [scene_map.points_seen_by(int(image)) for image in np.unique(np.concatenate(covisible))]
-    return np.unique(np.concatenate(seen)).astype(np.int64)
+    seen = [scene_map.points_seen_by(int(image)) for image in distinct(np.concatenate(covisible))]
+    return distinct(np.concatenate(seen)).astype(np.int64)

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import poselib
@@ -106,15 +106,18 @@ def estimate_pose(
     """
     options = options or PoseOptions()
     # what is said twice counts once
-    ends = np.hstack([keypoints, points])
-    distinct = np.flatnonzero(_heaviest_of_each(ends, np.asarray(weights, np.float64)))
+    by_weight = np.argsort(-np.asarray(weights, np.float64), kind='stable')
+    places = _numbered(np.asarray(keypoints, np.float64)), _numbered(points)
+    pairs = _numbered(np.stack(places, axis=1))
+    distinct = np.flatnonzero(_heaviest_of_each(pairs, by_weight))
     if len(distinct) < MIN_MATCHES:
         return None
     local = _LocalFrame.around(points[distinct])
     matches = _Matches(
         keypoints=np.asarray(keypoints[distinct], np.float64),
         points=local.from_map(points[distinct]),
-        weights=np.asarray(weights[distinct], np.float64),
+        by_weight=np.argsort(-np.asarray(weights[distinct], np.float64), kind='stable'),
+        places=tuple(each[distinct] for each in places),
         camera=camera,
         threshold=options.threshold_px(camera),
         nearest=np.ones(len(distinct), np.bool_) if nearest is None else nearest[distinct],
@@ -192,11 +195,22 @@ class _LocalFrame:
 
 @dataclass(frozen=True)
 class _Matches:
-    """Matches in the local frame, and what makes one of them an inlier."""
+    """Matches in the local frame, and what makes one of them an inlier.
+
+    Attributes:
+        keypoints: [K,2] px.
+        points: [K,3] in the local frame.
+        by_weight: [K] indices of the matches, the heaviest first.
+        places: Twice [K], numbers that matches with the same keypoint, or point, have in common.
+        camera: The camera.
+        threshold: Greatest reprojection error in the search [px].
+        nearest: [K] `Matches.nearest`.
+    """
 
     keypoints: NDArray[np.float64]
     points: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    by_weight: NDArray[np.int64]
+    places: tuple[NDArray[np.int64], ...]
     camera: pycolmap.Camera
     threshold: float
     nearest: NDArray[np.bool_]
@@ -208,8 +222,8 @@ class _Matches:
         more certain than it is.
         """
         inliers = errors <= threshold
-        for ends in (self.keypoints, self.points):
-            inliers &= _heaviest_of_each(ends, np.where(inliers, self.weights, -np.inf))
+        for numbers in self.places:
+            inliers = _heaviest_of_each(numbers, self.by_weight[inliers[self.by_weight]])
         return inliers
 
     def exact(self, inliers: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -255,8 +269,7 @@ def _search(matches: _Matches, options: PoseOptions) -> tuple[pycolmap.Rigid3d, 
     """
     ideal, ideal_keypoints = _without_distortion(matches.keypoints, matches.camera)
     usable = np.asarray(np.isfinite(ideal_keypoints).all(axis=1), np.bool_)
-    by_weight = np.argsort(-matches.weights, kind='stable')
-    by_weight = by_weight[usable[by_weight]]
+    by_weight = matches.by_weight[usable[matches.by_weight]]
     if len(by_weight) < MIN_MATCHES:
         return None
     found, info = poselib.estimate_absolute_pose(
@@ -329,14 +342,29 @@ def _refine(camera_from_local: pycolmap.Rigid3d, matches: _Matches) -> _Refined 
     return _Refined(camera_from_local, inliers, matches.exact(inliers), errors)
 
 
+def _numbered(rows: NDArray[Any]) -> NDArray[np.int64]:
+    """A number for each of some rows [K,D], the same for equal ones: 0, 1, ... in rising order."""
+    order = np.lexsort(rows.T)
+    rising = rows[order]
+    numbers = np.zeros(len(rows), np.int64)
+    numbers[order[1:]] = np.cumsum((rising[1:] != rising[:-1]).any(axis=1))
+    return numbers
+
+
 def _heaviest_of_each(
-    ends: NDArray[np.floating], weights: NDArray[np.float64]
+    numbers: NDArray[np.int64], by_weight: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
-    """Which matches [K] have the greatest weight of all with the same ends, rows of [K,D]."""
-    by_weight = np.argsort(-weights, kind='stable')
-    _, first = np.unique(ends[by_weight], axis=0, return_index=True)
-    heaviest = np.zeros(len(ends), np.bool_)
-    heaviest[by_weight[first]] = True
+    """Which matches [K] are the heaviest of all with the same number [K].
+
+    Args:
+        numbers: As `_numbered` gives them.
+        by_weight: Indices of the matches to choose from, the heaviest first.
+    """
+    heaviest = np.zeros(len(numbers), np.bool_)
+    # of several that are written to the same place the last one stays
+    heaviest_of = np.full(len(numbers), -1)
+    heaviest_of[numbers[by_weight[::-1]]] = by_weight[::-1]
+    heaviest[heaviest_of[heaviest_of >= 0]] = True
     return heaviest
 
 

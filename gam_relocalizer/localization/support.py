@@ -15,6 +15,7 @@ import numpy as np
 
 from gam_relocalizer.cameras import undistort
 from gam_relocalizer.localization.result import Support
+from gam_relocalizer.localization.scenes import distinct
 
 if TYPE_CHECKING:
     import pycolmap
@@ -87,7 +88,7 @@ def _expected_points(
         alike = cosine > np.cos(np.radians(_MAX_TURN_DEG))
         alike &= (far < _MAX_ZOOM * near) & (near < _MAX_ZOOM * far)
         expected.append(seen[alike])
-    return np.unique(np.concatenate(expected))
+    return distinct(np.concatenate(expected))
 
 
 def _seen_at(in_camera: NDArray[np.float64], camera: pycolmap.Camera) -> NDArray[np.float64]:

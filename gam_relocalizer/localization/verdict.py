@@ -188,8 +188,7 @@ def judge_look_alike(
         inlier_points: [K,3] positions of the inliers, map frame.
     """
     apart = _contradiction(estimate, look_alike.camera_from_map, inlier_points)
-    by_chance = look_alike.agreeing <= MAX_LOOK_ALIKES_BY_CHANCE
-    if apart is None or by_chance or look_alike.share <= MAX_LOOK_ALIKE_SHARE:
+    if apart is None or not are_many_look_alikes(look_alike.agreeing, look_alike.asked):
         return None
     return Verdict(
         Status.AMBIGUOUS,
@@ -197,6 +196,11 @@ def judge_look_alike(
         f'{apart.position:.3g} and {apart.rotation_deg:.0f} deg away; the map has several such '
         f'places',
     )
+
+
+def are_many_look_alikes(agreeing: int, asked: int) -> bool:
+    """Whether so many of the inliers that were asked speak against a pose."""
+    return agreeing > MAX_LOOK_ALIKES_BY_CHANCE and agreeing / asked > MAX_LOOK_ALIKE_SHARE
 
 
 def judge_focal_length(focal_length: FocalLength) -> Verdict | None:

@@ -67,8 +67,8 @@ class ContextNorm(nn.Module):
             features.reshape(size, batch * width),
             None,
             None,
-            self.scale.repeat(batch),
-            self.shift.repeat(batch),
+            self.scale.expand(batch, width).flatten(),
+            self.shift.expand(batch, width).flatten(),
             training=True,
             eps=NORM_EPSILON,
         )
@@ -92,7 +92,7 @@ class Block(nn.Module):
         """[S, B, width_in] -> [S, B, width_out]."""
         hidden = features
         for norm, linear in zip(self.norms, self.linears, strict=True):
-            hidden = linear(functional.relu(norm(hidden)))
+            hidden = linear(functional.relu(norm(hidden), inplace=True))
         shortcut: torch.Tensor = self.shortcut(features)
         return shortcut + hidden
 

@@ -152,11 +152,8 @@ def _exact_distances(
 
     Recomputed from differences, because sqrt(2 - 2 cos) loses half of the digits near zero.
     """
-    wanted, position = np.unique(neighbours, return_inverse=True)
-    directions, _ = _directions(point_descriptors[wanted])
-    differences = (
-        queries[:, None, :] - directions[torch.from_numpy(position.reshape(neighbours.shape))]
-    )
+    directions, _ = _directions(point_descriptors[neighbours.ravel()])
+    differences = queries[:, None, :] - directions.view(*neighbours.shape, directions.shape[1])
     distances = np.asarray(differences.norm(dim=2).numpy())
     distances[neighbours == NO_POINT] = np.inf
     return distances

@@ -22,6 +22,7 @@ from gam_relocalizer.localization.verdict import (
     FOCAL_LENGTH_SIGMAS,
     FOCAL_LENGTH_TOLERANCE,
     MAX_LOOK_ALIKE_SHARE,
+    MAX_LOOK_ALIKES_BY_CHANCE,
     MIRROR_MARGIN,
     VerdictOptions,
     coverage_of,
@@ -177,12 +178,12 @@ def test_refuses_an_image_that_is_more_like_the_map_when_mirrored() -> None:
 
 def test_refuses_a_pose_whose_inliers_look_like_another_place() -> None:
     elsewhere, here = rival(3.0, 0.0).camera_from_map, rival(0.2, 3.0).camera_from_map
-    many, few = MAX_LOOK_ALIKE_SHARE + 0.01, MAX_LOOK_ALIKE_SHARE - 0.01
-    verdict = judge_look_alike(GOOD, LookAlike(elsewhere, 100, many), POINTS)
+    few, by_chance = int(100 * MAX_LOOK_ALIKE_SHARE), MAX_LOOK_ALIKES_BY_CHANCE
+    verdict = judge_look_alike(GOOD, LookAlike(elsewhere, few + 1, 100), POINTS)
     assert verdict.status is Status.AMBIGUOUS
-    assert judge_look_alike(GOOD, LookAlike(elsewhere, 100, few), POINTS) is None
-    assert judge_look_alike(GOOD, LookAlike(elsewhere, 7, many), POINTS) is None
-    assert judge_look_alike(GOOD, LookAlike(here, 100, 1.0), POINTS) is None
+    assert judge_look_alike(GOOD, LookAlike(elsewhere, few, 100), POINTS) is None
+    assert judge_look_alike(GOOD, LookAlike(elsewhere, by_chance, by_chance), POINTS) is None
+    assert judge_look_alike(GOOD, LookAlike(here, 100, 100), POINTS) is None
 
 
 @given(st.floats(1e-3, 1e3))
