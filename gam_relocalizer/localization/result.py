@@ -16,28 +16,125 @@ if TYPE_CHECKING:
 
 @unique
 class Status(Enum):
-    """The verdict on one attempt. Numbers are those of RelocalizationStatus.msg."""
+    """The verdict on one attempt. Numbers are those of RelocalizationStatus.msg.
 
-    ACCEPTED = 0
-    UNDECODABLE_IMAGE = 1
-    NO_CALIBRATION = 2
-    NO_TRANSFORM = 3
-    STALE_IMAGE = 4
-    NO_IMAGE = 5
-    NOT_ACTIVE = 6
-    BUSY = 7
-    TOO_FEW_FEATURES = 10
-    NO_SCENE = 11
-    TOO_FEW_MATCHES = 12
-    NO_POSE = 13
-    TOO_FEW_INLIERS = 14
-    LOW_INLIER_RATIO = 15
-    POOR_COVERAGE = 16
-    UNCERTAIN = 17
-    IMPLAUSIBLE = 18
-    AMBIGUOUS = 19
-    CONTRADICTED = 20
-    MISCALIBRATED = 21
+    Attributes:
+        meaning: What it says, in a sentence.
+        remedy: What to do about it; empty where there is nothing to do.
+    """
+
+    meaning: str
+    remedy: str
+
+    def __new__(cls, number: int, meaning: str = '', remedy: str = '') -> Status:
+        """The number is the value, so that `Status(number)` finds it."""
+        status = object.__new__(cls)
+        status._value_ = number
+        status.meaning = meaning
+        status.remedy = remedy
+        return status
+
+    ACCEPTED = 0, 'A pose with this stamp is on `/relocalized_pose`.'
+    UNDECODABLE_IMAGE = (
+        1,
+        'The image has an unknown encoding, is truncated or damaged.',
+        'See `reason`; check the driver or the transport.',
+    )
+    NO_CALIBRATION = (
+        2,
+        'There is no CameraInfo, or one without calibration, or one of another image size.',
+        'Remap `camera_info`; calibrate; publish the CameraInfo of the same mode as the image.',
+    )
+    NO_TRANSFORM = (
+        3,
+        'A pose was found, but the mount of the camera is not known at that time.',
+        "Publish it in TF, set `base_from_camera`, or `base_frame: ''` for the camera's pose.",
+    )
+    STALE_IMAGE = (
+        4,
+        'The image is not newer than the last one tried.',
+        'Check that the driver stamps its images.',
+    )
+    NO_IMAGE = (
+        5,
+        'Answer of a service: no image came in time, or what was under way was dropped (another '
+        'map, time jumped back).',
+        'Remap `image`; check the driver; ask again.',
+    )
+    NOT_ACTIVE = (
+        6,
+        'Answer of a service: the node is not active, or was deactivated meanwhile.',
+        '`reason` names the command.',
+    )
+    BUSY = (
+        7,
+        "Answer of a service: too many wait already, or others' attempts took until the time was "
+        'over.',
+        'Ask again, less often.',
+    )
+    TOO_FEW_FEATURES = (
+        10,
+        'The image is dark, blurred or without texture.',
+        'Mind light, exposure and lens; it passes when the robot moves on.',
+    )
+    NO_SCENE = (11, 'No reference image was retrieved.', 'The map is empty: build it again.')
+    TOO_FEW_MATCHES = (
+        12,
+        'The place is not in the map, or looks different.',
+        'Map it, or map it in this light.',
+    )
+    NO_POSE = (
+        13,
+        'The matches agree on no pose.',
+        'Map the place, or map it in this light.',
+    )
+    TOO_FEW_INLIERS = (
+        14,
+        'Too few matches agree.',
+        'Map the place, or map it in this light; `min_inliers`.',
+    )
+    LOW_INLIER_RATIO = (
+        15,
+        'Too small a share of the matches agrees: probably chance.',
+        'Map the place, or map it in this light; `min_inlier_ratio`.',
+    )
+    POOR_COVERAGE = (
+        16,
+        'All that agrees lies in a small part of the image: one object, not the place.',
+        'Wait for a view that shows more; `min_coverage`.',
+    )
+    UNCERTAIN = (
+        17,
+        'The pose is not precise enough.',
+        'Wait for a view that shows more; `max_relative_std`, `max_rotation_std_deg`.',
+    )
+    IMPLAUSIBLE = (
+        18,
+        "The pose would see the reference image's points mirrored, as from behind a wall; or the "
+        'image looks more like the map when it is mirrored; or the base would lean beyond '
+        '`max_tilt_deg`; or odometry speaks against it, and it is held back.',
+        'Check that the images are not mirrored, that the mount is right, and what `odom` is of; '
+        'otherwise the image shows another place.',
+    )
+    AMBIGUOUS = (
+        19,
+        'Two scenes of the map make nearly as good a case for two different poses: the place looks '
+        'like another one in the map (the same poster, door or room twice).',
+        'Wait for a view that shows more; `min_odds_against_rival`.',
+    )
+    CONTRADICTED = (
+        20,
+        'Much of what should be in view of the pose is not in the image: what agrees is one thing '
+        'that hangs elsewhere too or was moved, or the view is mostly hidden.',
+        'Wait for a view that shows more. Where it stays so, the place has changed: map it again. '
+        '`min_belief`',
+    )
+    MISCALIBRATED = (
+        21,
+        'The image fits another focal length better than the given one.',
+        'Calibrate at the resolution and zoom that are used, and publish that CameraInfo. Check '
+        '`image_is_rectified`.',
+    )
 
 
 # Something beyond the pose itself speaks against it.
@@ -46,17 +143,22 @@ REFUTED = frozenset({Status.AMBIGUOUS, Status.MISCALIBRATED, Status.IMPLAUSIBLE}
 
 @dataclass(frozen=True)
 class Timings:
-    """Milliseconds spent in each stage of one query."""
+    """Milliseconds spent in each stage of one query.
+
+    `pose` finds and refines it, with its covariance; `verdict` is all that only decides whether to
+    believe it.
+    """
 
     extraction: float = 0.0
     retrieval: float = 0.0
     matching: float = 0.0
     pose: float = 0.0
+    verdict: float = 0.0
 
     @property
     def total(self) -> float:
         """Sum over the stages [ms]."""
-        return self.extraction + self.retrieval + self.matching + self.pose
+        return self.extraction + self.retrieval + self.matching + self.pose + self.verdict
 
 
 @dataclass(frozen=True)

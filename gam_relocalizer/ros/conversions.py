@@ -142,6 +142,7 @@ def status_message(result: LocalizationResult, header: Header, map_id: str) -> R
         retrieval_ms=float(timings.retrieval),
         matching_ms=float(timings.matching),
         pose_ms=float(timings.pose),
+        verdict_ms=float(timings.verdict),
         total_ms=float(timings.total),
     )
     if estimate is not None:

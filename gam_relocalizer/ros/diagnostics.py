@@ -12,6 +12,7 @@ from rclpy.clock_type import ClockType
 from std_msgs.msg import Header
 
 from gam_relocalizer.ros.conditions import diagnose
+from gam_relocalizer.ros.interface import Topic
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from gam_relocalizer.ros.conditions import Diagnosis
     from gam_relocalizer.ros.health import Health
 
-TOPIC = '/diagnostics'
-QUEUE_LENGTH = 10
 EACH_S = 1.0
 
 
@@ -34,10 +33,12 @@ class Diagnostics:
         self._node = node
         self._health = health
         # a lifecycle publisher would be silent when there is most to say
-        self._publisher = node.create_publisher(DiagnosticArray, TOPIC, QUEUE_LENGTH)
+        self._publisher = node.create_publisher(
+            Topic.DIAGNOSTICS.kind, Topic.DIAGNOSTICS.topic, Topic.DIAGNOSTICS.qos
+        )
         # the names of two robots' nodes differ in their namespaces only
         self._name = node.get_fully_qualified_name().lstrip('/')
-        self._hardware = node.resolve_topic_name('image')
+        self._hardware = node.resolve_topic_name(Topic.IMAGE.topic)
         node.create_timer(EACH_S, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _report(self) -> None:
@@ -53,8 +54,8 @@ class Diagnostics:
     def _message(self, diagnosis: Diagnosis) -> DiagnosticStatus:
         return DiagnosticStatus(
             level=bytes([diagnosis.level.value]),
-            name=f'{self._name}: {diagnosis.name}',
+            name=f'{self._name}: {diagnosis.part.value}',
             message=diagnosis.message,
             hardware_id=self._hardware,
-            values=[KeyValue(key=key, value=value) for key, value in diagnosis.values],
+            values=[KeyValue(key=value.key, value=value.text) for value in diagnosis.values],
         )

@@ -7,18 +7,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import (
-    DurabilityPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_policy_name_from_kind,
-)
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+
+from gam_relocalizer.ros.interface import Topic
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rclpy.node import Node
+    from sensor_msgs.msg import CameraInfo
 
     from gam_relocalizer.ros.parameters import NodeParameters
 
@@ -35,13 +32,18 @@ class Inputs:
     ) -> None:
         self._node = node
         compressed = parameters.image_transport == 'compressed'
+        image = Topic.COMPRESSED_IMAGE if compressed else Topic.IMAGE
         # image transports append to the name that `image` is remapped to
-        topic = node.resolve_topic_name('image') + ('/compressed' if compressed else '')
+        suffix = image.topic.removeprefix(Topic.IMAGE.topic)
+        topic = node.resolve_topic_name(Topic.IMAGE.topic) + suffix
         self._image = node.create_subscription(
-            CompressedImage if compressed else Image,
+            image.kind,
             topic,
             on_image,
-            _sensor_data(ReliabilityPolicy[parameters.image_reliability.upper()]),
+            QoSProfile(
+                depth=image.qos.depth,
+                reliability=ReliabilityPolicy[parameters.image_reliability.upper()],
+            ),
             event_callbacks=incompatible_qos(
                 node,
                 topic,
@@ -49,7 +51,10 @@ class Inputs:
             ),
         )
         self._camera_info = node.create_subscription(
-            CameraInfo, 'camera_info', on_camera_info, _sensor_data(ReliabilityPolicy.BEST_EFFORT)
+            Topic.CAMERA_INFO.kind,
+            Topic.CAMERA_INFO.topic,
+            on_camera_info,
+            Topic.CAMERA_INFO.qos,
         )
 
     @property
@@ -81,8 +86,3 @@ def incompatible_qos(node: Node, topic: str, cure: str) -> SubscriptionEventCall
         )
 
     return SubscriptionEventCallbacks(incompatible_qos=report)
-
-
-def _sensor_data(reliability: ReliabilityPolicy) -> QoSProfile:
-    """SensorDataQoS with room for the newest message alone."""
-    return QoSProfile(depth=1, reliability=reliability, durability=DurabilityPolicy.VOLATILE)

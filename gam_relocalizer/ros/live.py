@@ -218,6 +218,7 @@ class _Listener:
                 'retrieval': message.retrieval_ms,
                 'matching': message.matching_ms,
                 'pose': message.pose_ms,
+                'verdict': message.verdict_ms,
             },
         )
 

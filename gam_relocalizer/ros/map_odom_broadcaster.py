@@ -16,7 +16,7 @@ from geometry_msgs.msg import Transform, TransformStamped, Vector3
 from std_msgs.msg import Header
 
 from gam_relocalizer.ros.conversions import nanoseconds_from, pose_message, stamp_from
-from gam_relocalizer.ros.transform_listener import TF, TF_QOS, TFMessage
+from gam_relocalizer.ros.interface import TFMessage, Topic
 
 if TYPE_CHECKING:
     import pycolmap
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 # A frame that somebody else has moved so recently [s] is his: some broadcast at 1 Hz only.
 RIVAL_S = 5.0
 # So many may be under way to ourselves: as many as a publisher and a subscription keep.
-REMEMBERED = 2 * TF_QOS.depth
+REMEMBERED = 2 * Topic.MAP_ODOM.qos.depth
 SAY_EACH_S = 10.0
 # Nothing is missed before publishers have had so long to be found [s].
 PATIENCE_S = 1.0
@@ -72,7 +72,9 @@ class MapOdomBroadcaster:
         transforms.watch(self._on_transform)
         if TFMessage is None:  # the listener has said so
             return
-        self._publisher = node.create_publisher(TFMessage, TF, TF_QOS)
+        self._publisher = node.create_publisher(
+            Topic.MAP_ODOM.kind, Topic.MAP_ODOM.topic, Topic.MAP_ODOM.qos
+        )
         self._timer = node.create_timer(1.0 / parameters.map_odom_rate, self._on_tick)
 
     @property

@@ -27,9 +27,10 @@ from gam_relocalizer.localization.localizer import Localizer
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.ros.diagnostics import Diagnostics
 from gam_relocalizer.ros.health import Health, State
+from gam_relocalizer.ros.interface import MAP_POINTS_SHOWN
 from gam_relocalizer.ros.map_loader import MapLoader
 from gam_relocalizer.ros.memory import give_back_freed_memory
-from gam_relocalizer.ros.outputs import MAP_POINTS_SHOWN, Outputs
+from gam_relocalizer.ros.outputs import Outputs
 from gam_relocalizer.ros.parameters import declare_parameters, fixed_changes, known_among
 from gam_relocalizer.ros.requests import Answer, answered
 from gam_relocalizer.ros.services import Services

@@ -7,17 +7,9 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.qos import (
-    DurabilityPolicy,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_policy_name_from_kind,
-    qos_profile_sensor_data,
-)
-from sensor_msgs.msg import Image, PointCloud2
+from rclpy.qos import qos_policy_name_from_kind
 
 from gam_relocalizer.ros.conversions import (
     image_message,
@@ -26,11 +18,12 @@ from gam_relocalizer.ros.conversions import (
     pose_with_covariance_message,
     status_message,
 )
-from gam_relocalizer_msgs.msg import RelocalizationStatus
+from gam_relocalizer.ros.interface import PATH_LENGTH, Topic
 
 if TYPE_CHECKING:
     import numpy as np
     import pycolmap
+    from geometry_msgs.msg import PoseStamped
     from numpy.typing import NDArray
     from rclpy.lifecycle import LifecycleNode
     from std_msgs.msg import Header
@@ -38,34 +31,23 @@ if TYPE_CHECKING:
     from gam_relocalizer.localization.result import LocalizationResult
     from gam_relocalizer.localization.robot_pose import RobotPose
 
-POSE_TOPIC = '/relocalized_pose'
-# Serves subscribers that are sensor-data, reliable or transient-local; late ones get the last fix.
-LATCHED_QOS = QoSProfile(
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-PATH_LENGTH = 1000
-# 1.2 MB: the message is kept for late subscribers, and sent to each of them at once.
-MAP_POINTS_SHOWN = 100_000
-
 
 class Outputs:
     """The publishers; silent while the node is not active."""
 
     def __init__(self, node: LifecycleNode) -> None:
 
-        def create(kind: type, name: str, qos: QoSProfile) -> Any:  # noqa: ANN401 - untyped
+        def create(topic: Topic) -> Any:  # noqa: ANN401 - untyped
             return node.create_lifecycle_publisher(
-                kind, name, qos, event_callbacks=_incompatible_qos(node, name, qos)
+                topic.kind, topic.topic, topic.qos, event_callbacks=_incompatible_qos(node, topic)
             )
 
-        self._pose = create(PoseWithCovarianceStamped, POSE_TOPIC, LATCHED_QOS)
-        self._camera_pose = create(PoseStamped, '~/camera_pose', QoSProfile(depth=10))
-        self._status = create(RelocalizationStatus, '~/status', QoSProfile(depth=10))
-        self._path = create(Path, '~/path', QoSProfile(depth=1))
-        self._map_points = create(PointCloud2, '~/map_points', LATCHED_QOS)
-        self._debug_image = create(Image, '~/debug_image', qos_profile_sensor_data)
+        self._pose = create(Topic.POSE)
+        self._camera_pose = create(Topic.CAMERA_POSE)
+        self._status = create(Topic.STATUS)
+        self._path = create(Topic.PATH)
+        self._map_points = create(Topic.MAP_POINTS)
+        self._debug_image = create(Topic.DEBUG_IMAGE)
         self._fixes: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
 
     def publish_fix(
@@ -106,15 +88,16 @@ class Outputs:
         self._fixes.clear()
 
 
-def _incompatible_qos(node: LifecycleNode, name: str, qos: QoSProfile) -> PublisherEventCallbacks:
+def _incompatible_qos(node: LifecycleNode, topic: Topic) -> PublisherEventCallbacks:
     """Says in the log which listener is not served, and what to change."""
-    topic = node.resolve_topic_name(name)
-    reliability, durability = (policy.name.lower() for policy in (qos.reliability, qos.durability))
+    name = node.resolve_topic_name(topic.topic)
+    policies = topic.qos.reliability, topic.qos.durability
+    reliability, durability = (policy.name.lower() for policy in policies)
 
     def report(event: Any) -> None:  # noqa: ANN401 - a type of the extension module
         policy = qos_policy_name_from_kind(event.last_policy_kind)
         node.get_logger().warning(
-            f'nothing will be sent to a subscription to {topic}: its quality of service '
+            f'nothing will be sent to a subscription to {name}: its quality of service '
             f'({policy}) is not compatible; subscribe with reliability {reliability} and '
             f'durability {durability}'
         )

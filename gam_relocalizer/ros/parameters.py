@@ -40,6 +40,7 @@ class Specification:
 
     Attributes:
         description: One sentence for `ros2 param describe`.
+        unit: Of a number; empty for one without.
         bounds: Smallest and largest value of a number.
         choices: The words a text may be; empty when it may be any.
         fixed: Read while the node configures; refused from then on until it is cleaned up.
@@ -47,6 +48,7 @@ class Specification:
     """
 
     description: str
+    unit: str = ''
     bounds: tuple[float, float] | None = None
     choices: tuple[str, ...] = ()
     fixed: bool = False
@@ -56,6 +58,8 @@ class Specification:
     def constraints(self) -> str:
         """What the ranges of a descriptor cannot express, in words."""
         parts = []
+        if self.unit:
+            parts.append(f'unit: {self.unit}')
         if self.choices:
             parts.append(f'one of: {", ".join(self.choices)}')
         if self.fixed:
@@ -103,7 +107,7 @@ class NodeParameters:
         'frame [m]; empty: looked up in /tf and /tf_static.',
     )
     period: float = _parameter(
-        2.0, 'Seconds (node clock) between two attempts.', bounds=(0.01, 3600.0)
+        2.0, 'Time between two attempts, by the clock of the node.', unit='s', bounds=(0.01, 3600.0)
     )
     image_transport: str = _parameter(
         'raw',
@@ -177,7 +181,8 @@ class NodeParameters:
     )
     max_rotation_std_deg: float = _parameter(
         _VERDICT.max_rotation_std_deg,
-        'Greatest standard deviation of the orientation [deg].',
+        'Greatest standard deviation of the orientation.',
+        unit='deg',
         bounds=(1e-6, 180.0),
     )
     min_belief: float = _parameter(
@@ -198,8 +203,9 @@ class NodeParameters:
     )
     max_tilt_deg: float = _parameter(
         _CONTINUITY.max_tilt_deg,
-        'Furthest that the base ever leans from upright [deg]: poses that lean further are wrong; '
-        '180: it may lean in any way.',
+        'Furthest that the base ever leans from upright: poses that lean further are wrong; 180: '
+        'it may lean in any way.',
+        unit='deg',
         bounds=(0.0, 180.0),
     )
     position_covariance_scale: float = _parameter(
@@ -214,12 +220,14 @@ class NodeParameters:
     )
     position_std_floor: float = _parameter(
         _COVARIANCE.position_floor,
-        'Standard deviation that is added to each coordinate: errors of the map itself [m].',
+        'Standard deviation that is added to each coordinate: errors of the map itself.',
+        unit='m',
         bounds=(1e-6, 100.0),
     )
     orientation_std_floor: float = _parameter(
         _COVARIANCE.orientation_floor,
-        'Standard deviation that is added about each axis: errors of the map itself [rad].',
+        'Standard deviation that is added about each axis: errors of the map itself.',
+        unit='rad',
         bounds=(1e-6, 3.0),
     )
     covariance_mode: str = _parameter(
@@ -235,12 +243,16 @@ class NodeParameters:
         fixed=True,
     )
     map_odom_rate: float = _parameter(
-        20.0, 'Broadcasts of that transform per second (node clock) [Hz].', bounds=(0.1, 1000.0)
+        20.0,
+        'Broadcasts of that transform per second, by the clock of the node.',
+        unit='Hz',
+        bounds=(0.1, 1000.0),
     )
     transform_tolerance: float = _parameter(
         0.1,
         'How far the stamp of that transform lies ahead of the clock, so that others find it valid '
-        'until the next one comes [s].',
+        'until the next one comes.',
+        unit='s',
         bounds=(0.0, 10.0),
     )
     torch_threads: int = _parameter(

@@ -7,30 +7,23 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from gam_relocalizer.localization.continuity import is_odometry_of
 from gam_relocalizer.localization.robot_pose import RobotPose
 from gam_relocalizer.replay.messages import rigid_in
 from gam_relocalizer.ros.conversions import nanoseconds_from
 from gam_relocalizer.ros.inputs import incompatible_qos
+from gam_relocalizer.ros.interface import Topic
 
 if TYPE_CHECKING:
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from nav_msgs.msg import Odometry
     from rclpy.node import Node
 
     from gam_relocalizer.localization.continuity import Continuity
     from gam_relocalizer.ros.health import Health
     from gam_relocalizer.ros.parameters import NodeParameters
 
-# SensorDataQoS, with room for what a quick odometry sends while this thread has no turn.
-ODOMETRY_QOS = QoSProfile(
-    depth=50, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE
-)
-INITIAL_POSE_QOS = QoSProfile(
-    depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE
-)
 SAY_EACH_S = 10.0
 SAY_INITIAL_POSE_EACH_S = 1.0
 
@@ -48,14 +41,16 @@ class PriorListener:
         self._continuity = continuity
         self._health = health
         self._odometry_frame: str | None = None
-        self._odometry = node.create_subscription(Odometry, 'odom', self._on_odometry, ODOMETRY_QOS)
-        topic = node.resolve_topic_name('initialpose')
+        self._odometry = node.create_subscription(
+            Topic.ODOMETRY.kind, Topic.ODOMETRY.topic, self._on_odometry, Topic.ODOMETRY.qos
+        )
+        topic = node.resolve_topic_name(Topic.INITIAL_POSE.topic)
         cure = 'publish it reliably'
         self._initial_pose = node.create_subscription(
-            PoseWithCovarianceStamped,
+            Topic.INITIAL_POSE.kind,
             topic,
             self._on_initial_pose,
-            INITIAL_POSE_QOS,
+            Topic.INITIAL_POSE.qos,
             event_callbacks=incompatible_qos(node, topic, cure),
         )
 

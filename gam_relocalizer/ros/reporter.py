@@ -14,6 +14,7 @@ from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import robot_pose
 from gam_relocalizer.ros.conversions import pixels_from, stamp_from
 from gam_relocalizer.ros.debug_image import draw_attempt
+from gam_relocalizer.ros.interface import Topic
 from gam_relocalizer.ros.requests import Answer
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Reporter:
         health: Health,
     ) -> None:
         self._log = node.get_logger()
-        self._odometry_topic = node.resolve_topic_name('odom')
+        self._odometry_topic = node.resolve_topic_name(Topic.ODOMETRY.topic)
         self._parameters = parameters
         self._outputs = outputs
         self._mount = mount

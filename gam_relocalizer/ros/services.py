@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from std_msgs.msg import Header
-from std_srvs.srv import SetBool
 
 from gam_relocalizer.ros.conversions import (
     nanoseconds_from,
@@ -16,14 +15,16 @@ from gam_relocalizer.ros.conversions import (
     stamp_from,
     status_message,
 )
-from gam_relocalizer_msgs.srv import LoadMap, LocalizeImage, Relocalize
+from gam_relocalizer.ros.interface import Service
 
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.task import Future
     from sensor_msgs.msg import CameraInfo, Image
+    from std_srvs.srv import SetBool
 
     from gam_relocalizer.ros.requests import Answer
+    from gam_relocalizer_msgs.srv import LoadMap, LocalizeImage, Relocalize
 
 DEFAULT_TIMEOUT_S = 5.0
 NANOSECONDS = 10**9
@@ -63,13 +64,13 @@ class Services:
     def __init__(self, node: Node, desk: Desk) -> None:
         self._desk = desk
         group = ReentrantCallbackGroup()
-        for kind, name, callback in (
-            (Relocalize, '~/relocalize', self._relocalize),
-            (LocalizeImage, '~/localize_image', self._localize_image),
-            (LoadMap, '~/load_map', self._load_map),
-            (SetBool, '~/set_enabled', self._set_enabled),
+        for offered, callback in (
+            (Service.RELOCALIZE, self._relocalize),
+            (Service.LOCALIZE_IMAGE, self._localize_image),
+            (Service.LOAD_MAP, self._load_map),
+            (Service.SET_ENABLED, self._set_enabled),
         ):
-            node.create_service(kind, name, callback, callback_group=group)
+            node.create_service(offered.kind, offered.service, callback, callback_group=group)
 
     async def _relocalize(
         self, request: Relocalize.Request, response: Relocalize.Response

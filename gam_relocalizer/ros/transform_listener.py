@@ -7,19 +7,11 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-
 from gam_relocalizer.errors import TransformError
 from gam_relocalizer.ros.conversions import nanoseconds_from, rigid3d_from_message
 from gam_relocalizer.ros.inputs import incompatible_qos
+from gam_relocalizer.ros.interface import TFMessage, Topic
 from gam_relocalizer.transforms import TransformTree
-
-try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # an installation of ROS 2 from pip has no tf2_msgs of its own
-    TFMessage = None
-
-__all__ = ['TF', 'TF_QOS', 'TFMessage', 'TransformListener']
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,15 +23,6 @@ if TYPE_CHECKING:
     # is called with a transform, and whether it is a static one
     Watcher = Callable[[TransformStamped, bool], None]
 
-TF = '/tf'
-TF_STATIC = '/tf_static'
-# Those of tf2_ros.
-TF_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-TF_STATIC_QOS = QoSProfile(
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 WARN_EACH_S = 10.0
 
 
@@ -65,8 +48,8 @@ class TransformListener:
                 '`base_from_camera` and leave `publish_map_odom` off'
             )
             return
-        self._subscribe(TF, TF_QOS, static=False)
-        self._subscribe(TF_STATIC, TF_STATIC_QOS, static=True)
+        self._subscribe(Topic.TF, static=False)
+        self._subscribe(Topic.TF_STATIC, static=True)
 
     def watch(self, watcher: Watcher) -> None:
         """Subscribes, and shows somebody every transform as it comes."""
@@ -79,16 +62,16 @@ class TransformListener:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
 
-    def _subscribe(self, name: str, qos: QoSProfile, *, static: bool) -> None:
-        topic = self._node.resolve_topic_name(name)
-        cure = f'publish {name} as tf2_ros does'
+    def _subscribe(self, topic: Topic, *, static: bool) -> None:
+        name = self._node.resolve_topic_name(topic.topic)
+        cure = f'publish {topic.topic} as tf2_ros does'
         self._subscriptions.append(
             self._node.create_subscription(
-                TFMessage,
-                topic,
-                partial(self._take_in, topic=topic, static=static),
-                qos,
-                event_callbacks=incompatible_qos(self._node, topic, cure),
+                topic.kind,
+                name,
+                partial(self._take_in, topic=name, static=static),
+                topic.qos,
+                event_callbacks=incompatible_qos(self._node, name, cure),
             )
         )
 

@@ -2,26 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import re
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from gam_relocalizer.ros.interface import Topic
+
 REPOSITORY = Path(__file__).parents[2]
-
-
-@dataclass(frozen=True)
-class Topic:
-    """A row of the table of topics in docs/ros_interface.md."""
-
-    is_input: bool
-    type: str
-    reliable: bool
-    transient_local: bool
 
 
 class StrictLoader(yaml.SafeLoader):
@@ -65,20 +55,7 @@ def rviz() -> dict[str, Any]:
 @pytest.fixture(scope='session')
 def topics() -> dict[str, Topic]:
     """All topics of a node without a namespace, by their full names."""
-    page = (REPOSITORY / 'docs' / 'ros_interface.md').read_text(encoding='utf-8')
-    rows = re.findall(r'^\| (in|out) \| (.+?) \| (\w+/\w+).*? \| (.+?) \|$', page, re.MULTILINE)
-    found = {
-        full_name(name): Topic(
-            is_input=direction == 'in',
-            type=kind,
-            reliable='best effort' not in qos,
-            transient_local='transient local' in qos,
-        )
-        for direction, names, kind, qos in rows
-        for name in re.findall(r'`([~/\w]+)`', names)
-    }
-    assert len(rows) >= 12
-    return found
+    return {full_name(topic.topic): topic for topic in Topic}
 
 
 def full_name(name: str) -> str:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from conftest import Topic
+    from gam_relocalizer.ros.interface import Topic
 
 BOOL, DOUBLE, TEXT = Parameter.Type.BOOL, Parameter.Type.DOUBLE, Parameter.Type.STRING
 BOOLS, DOUBLES = Parameter.Type.BOOL_ARRAY, Parameter.Type.DOUBLE_ARRAY

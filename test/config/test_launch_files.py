@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from rclpy.qos import DurabilityPolicy
 
 from gam_relocalizer.ros.parameters import SPECIFICATIONS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from conftest import Topic
+    from gam_relocalizer.ros.interface import Topic
 
 REPOSITORY = Path(__file__).parents[2]
 FOLDER = REPOSITORY / 'launch'
@@ -206,5 +207,5 @@ def test_the_replay_waits_for_a_topic_that_is_latched(topics: dict[str, Topic]) 
     topic = topics['/gam_relocalizer/map_points']
 
     assert f'{package}/{message}' == topic.type
-    assert topic.transient_local
+    assert topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
     assert words[words.index('--qos-durability') + 1] == 'transient_local'

@@ -8,6 +8,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from gam_relocalizer.ros.parameters import NodeParameters
 from gam_relocalizer_msgs.msg import RelocalizationStatus
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from conftest import Topic
+    from gam_relocalizer.ros.interface import Topic
 
 # rviz_default_plugins/plugins_description.xml (ros2/rviz, branch jazzy,
 # 591594ee5ae37122fd27c48ca349f7c71c2ccf19): displays with a topic, and what they show.
@@ -29,8 +30,14 @@ DISPLAYS = {
 DISPLAYS_WITHOUT_TOPIC = {'rviz_default_plugins/Grid', 'rviz_default_plugins/TF'}
 # rviz_common/src/rviz_common/properties/qos_profile_property.cpp
 TOPIC_KEYS = {'Value', 'Depth', 'History Policy', 'Reliability Policy', 'Durability Policy'}
-RELIABILITY = {'Reliable': True, 'Best Effort': False}
-DURABILITY = {'Transient Local': True, 'Volatile': False}
+RELIABILITY = {
+    'Reliable': ReliabilityPolicy.RELIABLE,
+    'Best Effort': ReliabilityPolicy.BEST_EFFORT,
+}
+DURABILITIES = {
+    'Transient Local': {DurabilityPolicy.TRANSIENT_LOCAL},
+    'Volatile': {DurabilityPolicy.VOLATILE, DurabilityPolicy.SYSTEM_DEFAULT},
+}
 
 # packages/suite-base/src/panels/index.ts (lichtblick-suite/lichtblick, the open successor of
 # Foxglove Studio, 66adecb99ca4363b1028c750919c9046609f5c85).
@@ -73,8 +80,8 @@ def test_rviz_hears_all_that_the_node_offers(
         offered = topics[wanted['Value']]
         assert wanted.keys() == TOPIC_KEYS
         # more than is offered: nothing comes; less: a late RViz shows no map
-        assert RELIABILITY[wanted['Reliability Policy']] == offered.reliable, display['Name']
-        assert DURABILITY[wanted['Durability Policy']] == offered.transient_local, display['Name']
+        assert RELIABILITY[wanted['Reliability Policy']] == offered.qos.reliability, display['Name']
+        assert offered.qos.durability in DURABILITIES[wanted['Durability Policy']], display['Name']
 
 
 def test_rviz_draws_in_the_frame_of_the_map(rviz: dict[str, Any]) -> None:

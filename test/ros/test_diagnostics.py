@@ -33,7 +33,7 @@ def first_report(graph: Graph, node: Node, health: Health) -> DiagnosticArray:
 
 def test_nodes_of_two_robots_have_names_of_their_own(graph: Graph) -> None:
     report = first_report(graph, rclpy.create_node('relocalizer', namespace='/front'), Health())
-    expected = [f'front/relocalizer: {one.name}' for one in diagnose(Health())]
+    expected = [f'front/relocalizer: {one.part.value}' for one in diagnose(Health())]
     assert [status.name for status in report.status] == expected
     assert {status.hardware_id for status in report.status} == {'/front/image'}
 
@@ -45,7 +45,9 @@ def test_level_message_and_values_are_those_of_the_diagnosis(graph: Graph) -> No
     expected = diagnose(health)[0]
     assert state.level == DiagnosticStatus.ERROR
     assert state.message == expected.message
-    assert [(pair.key, pair.value) for pair in state.values] == list(expected.values)
+    assert [(pair.key, pair.value) for pair in state.values] == [
+        (value.key, value.text) for value in expected.values
+    ]
 
 
 def test_reports_come_while_the_clock_of_the_node_stands(graph: Graph) -> None:

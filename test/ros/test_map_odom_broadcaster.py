@@ -27,6 +27,7 @@ from gam_relocalizer.ros.conversions import (
     stamp_from,
 )
 from gam_relocalizer.ros.health import Health
+from gam_relocalizer.ros.interface import Topic
 from gam_relocalizer.ros.map_odom_broadcaster import (
     REMEMBERED,
     RIVAL_S,
@@ -36,7 +37,7 @@ from gam_relocalizer.ros.map_odom_broadcaster import (
 )
 from gam_relocalizer.ros.parameters import NodeParameters
 from gam_relocalizer.ros.prior_listener import PriorListener
-from gam_relocalizer.ros.transform_listener import TF_STATIC_QOS, TransformListener
+from gam_relocalizer.ros.transform_listener import TransformListener
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -293,7 +294,7 @@ def test_somebody_who_says_the_frame_is_static_silences_it(
     make_world: Callable[..., World], graph: Graph, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A static transform is said once, here before there is any odometry."""
-    publisher = graph.world.create_publisher(TFMessage, '/tf_static', TF_STATIC_QOS)
+    publisher = graph.world.create_publisher(TFMessage, '/tf_static', Topic.TF_STATIC.qos)
     publisher.publish(TFMessage(transforms=[transform_message('map', 'odom', planar(9, 9, 0))]))
     world = make_world()
     graph.spin_until(lambda: 'odom' in world.transforms.tree.frames, 'the static transform')

@@ -99,14 +99,6 @@ def test_the_file_of_parameters_agrees_with_the_declarations() -> None:
         assert type(parameters[entry.name]) is type(entry.default), entry.name
 
 
-def test_the_documentation_lists_every_parameter() -> None:
-    page = (REPOSITORY / 'docs' / 'ros_interface.md').read_text(encoding='utf-8')
-    assert [name for name in SPECIFICATIONS if f'| `{name}` |' not in page] == []
-    for name, specification in SPECIFICATIONS.items():
-        row = next(line for line in page.splitlines() if line.startswith(f'| `{name}` |'))
-        assert ', '.join(specification.choices) in row
-
-
 @pytest.mark.parametrize('name', NUMBERS)
 def test_numbers_beyond_their_bounds_are_refused(name: str) -> None:
     low, high = SPECIFICATIONS[name].bounds

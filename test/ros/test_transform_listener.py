@@ -13,7 +13,8 @@ from tf2_msgs.msg import TFMessage
 
 from gam_relocalizer.errors import TransformError
 from gam_relocalizer.geometry import rigid3d_from, rigid3d_from_rotation
-from gam_relocalizer.ros.transform_listener import TF_QOS, TransformListener
+from gam_relocalizer.ros.interface import Topic
+from gam_relocalizer.ros.transform_listener import TransformListener
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,7 +71,7 @@ class PanTilt:
     """A head on a mast that says now and then how it is turned."""
 
     def __init__(self, graph: Graph) -> None:
-        self._publisher = graph.world.create_publisher(TFMessage, '/tf', TF_QOS)
+        self._publisher = graph.world.create_publisher(TFMessage, '/tf', Topic.TF.qos)
         graph.spin_until(self._publisher.get_subscription_count, 'a subscription')
 
     def say(self, stamp_ns: int, pan: float, tilt: float = 0.0) -> None:

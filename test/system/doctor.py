@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticArray
 from live_robot import NODE, wait_for
 
-from gam_relocalizer.ros.conditions import diagnose
-from gam_relocalizer.ros.health import Health
+from gam_relocalizer.ros.conditions import Part
 
 if TYPE_CHECKING:
     from diagnostic_msgs.msg import DiagnosticStatus
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
 
     from gam_relocalizer.ros.conditions import Condition
 
-PARTS = [one.name for one in diagnose(Health())]
+PARTS = [part.value for part in Part]
 
 
 class Doctor:

@@ -114,7 +114,7 @@ def test_reports_come_once_a_second_with_every_part_and_key(patient: Patient) ->
     wait_for(lambda: len(heard) > 4, 'five reports')
     stamps = [one.header.stamp.sec + one.header.stamp.nanosec / 1e9 for one in heard[:5]]
     assert 2.0 < stamps[-1] - stamps[0] < 20.0  # a busy machine may be late, never early
-    expected = [(one.name, [key for key, _ in one.values]) for one in diagnose(Health())]
+    expected = [(one.part.value, [value.key for value in one.values]) for one in diagnose(Health())]
     for array in heard[:5]:
         assert [
             (status.name.removeprefix('gam_relocalizer: '), [pair.key for pair in status.values])
