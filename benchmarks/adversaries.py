@@ -51,7 +51,6 @@ from gam_relocalizer.evaluation.calibration import (
     precision_recall_figure,
     reliability_figure,
     summarise_nees,
-    write_figure,
 )
 from gam_relocalizer.evaluation.metrics import CORRECT
 from gam_relocalizer.features.registry import create_extractor
@@ -60,6 +59,7 @@ from gam_relocalizer.images import read_image
 from gam_relocalizer.localization.localizer import Localizer
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.matching.registry import create_matcher
+from gam_relocalizer.plots import write_picture
 from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
@@ -341,8 +341,8 @@ def _report(records: Sequence[Record], out: Path) -> str:
         [record.is_right for record in with_pose],
         sum(record.has_truth for record in records),
     )
-    write_figure(out / 'reliability.png', reliability_figure(calibration))
-    write_figure(out / 'precision_recall.png', precision_recall_figure(curve))
+    write_picture(out / 'reliability.png', reliability_figure(calibration))
+    write_picture(out / 'precision_recall.png', precision_recall_figure(curve))
     reliability = [
         f'| {one.low:.1f} - {one.high:.1f} | {one.count} | {one.confidence:.3f} '
         f'| {one.correct:.3f} |'

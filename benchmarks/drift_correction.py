@@ -35,12 +35,12 @@ from gam_relocalizer.demo.recording import GROUND_TRUTH_TOPIC, ODOMETRY_TOPIC, r
 from gam_relocalizer.demo.shipped import demo_map_path
 from gam_relocalizer.demo.trajectories import BASE_FROM_CAMERA
 from gam_relocalizer.demo.world import demo_world
-from gam_relocalizer.evaluation.calibration import write_figure
 from gam_relocalizer.geometry import pose_error, rigid3d_from_rotation, write_text
 from gam_relocalizer.localization.continuity import Continuity
 from gam_relocalizer.localization.localizer import Localizer
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import RobotPose, robot_pose
+from gam_relocalizer.plots import write_picture
 from gam_relocalizer.replay.drift import TimedPose, TrajectoryError, trajectories_of
 from gam_relocalizer.replay.figures import REFUSED, draw_drift
 from gam_relocalizer.replay.replay import DELAY_NS, ReplayOptions, replay_bag
@@ -176,7 +176,7 @@ def main() -> None:
         'rows': [asdict(row) for row in rows],
     }
     write_text(arguments.out / 'drift_correction.json', json.dumps(content, indent=2) + '\n')
-    write_figure(
+    write_picture(
         arguments.out / 'drift_correction.png', _figure(found, odometries, arguments.wrong_by)
     )
     print(report)

@@ -9,10 +9,13 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.collections import PathCollection
 
 from gam_relocalizer.geometry import rotation_of
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
@@ -20,9 +23,15 @@ if TYPE_CHECKING:
     from gam_relocalizer.scene_map import SceneMap
 
 POINT, REFERENCE = '#8a8f98', '#c9a227'
+# What was found, what was refused: blue and red can be told apart by everybody.
+FOUND, REFUSED = '#0b62c4', '#d62728'
+# For things that only differ: none like the two above.
+OTHERS = ('#2ca089', '#f2a33a', '#b04fa8', '#777777', '#7a5230', '#8fb339', '#3f3d9e', '#111111')
+# Inches: a column of a page, and on a phone still to be read.
+WIDTH = 4.8
 MAX_POINTS_DRAWN = 60_000
-LABEL_SIZE = 9
-DPI = 120
+LABEL_SIZE = 10
+DPI = 150
 # Cameras that look up or down by turns are still held upright on average.
 MAX_TILT_DEG = 30.0
 
@@ -92,6 +101,13 @@ def png(figure: Figure) -> bytes:
     return stream.getvalue()
 
 
+def write_picture(file: Path, figure: Figure) -> None:
+    """Writes a PNG under a temporary name, then renames it."""
+    temporary = file.with_name(f'.{file.name}.part')
+    temporary.write_bytes(png(figure))
+    temporary.replace(file)
+
+
 def dots(axes: Axes, places: NDArray[np.float64], **style: Any) -> None:  # noqa: ANN401
     """Places [N,2] without an outline."""
     axes.scatter(places[:, 0], places[:, 1], **{'linewidths': 0, **style})
@@ -110,6 +126,35 @@ def fit_axes(axes: Axes, points: NDArray[np.float64], bodies: NDArray[np.float64
     axes.set_aspect('equal', adjustable='box')
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.tick_params(labelsize=8)
+
+
+def fit_figure(figure: Figure) -> None:
+    """Gives a figure of one map the height that the map's shape asks for."""
+    axes = figure.axes[0]
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    share = (high - low) / max(right - left, 1e-9)
+    figure.set_size_inches(WIDTH, float(np.clip(0.85 * WIDTH * share, 1.2, 1.2 * WIDTH)) + 1.7)
+
+
+def legend_below(axes: Axes) -> None:
+    """A legend that covers nothing, its marks large enough to be seen."""
+    if not axes.get_legend_handles_labels()[0]:
+        return
+    legend = axes.legend(
+        loc='upper center', bbox_to_anchor=(0.5, 0.0), borderaxespad=4.0, ncols=2,
+        fontsize=LABEL_SIZE, frameon=False, columnspacing=1.2, handletextpad=0.5,
+    )  # fmt: skip
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):
+            handle.set_alpha(1.0)
+            handle.set_sizes([24])
+
+
+def finish(axes: Axes) -> None:
+    """What all charts share."""
+    axes.grid(alpha=0.3, linewidth=0.6)
+    axes.tick_params(labelsize=LABEL_SIZE)
+    axes.spines[['top', 'right']].set_visible(False)
 
 
 def thinned(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from gam_relocalizer.plots import MAX_POINTS_DRAWN, REFERENCE, dots, png
+from gam_relocalizer.plots import MAX_POINTS_DRAWN, REFERENCE, dots, write_picture
 from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
@@ -53,6 +53,4 @@ def draw_over_occupancy(path: Path, frame: MapFrame, picks: Picks, picture: Path
     axes.scatter(given[:, 0], given[:, 1], s=40, c=_PICK, marker='x', label='picks')
     axes.set(xlim=(0, width), ylim=(height, 0), xlabel='column [px]', ylabel='row [px]')
     axes.legend(loc='upper right')
-    temporary = picture.with_name(f'.{picture.name}.part')
-    temporary.write_bytes(png(figure))
-    temporary.replace(picture)
+    write_picture(picture, figure)

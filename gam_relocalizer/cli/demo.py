@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pycolmap
 
     from gam_relocalizer.localization.localizer import Localizer
-    from gam_relocalizer.replay.result import Illustration
+    from gam_relocalizer.replay.result import TimedIllustration
     from gam_relocalizer.replay.summary import Row, Summary
 
 PERIOD_S = 2.0
@@ -116,16 +116,15 @@ def _truth(bag: Path) -> dict[int, pycolmap.Rigid3d]:
 
 def _illustrations(
     bag: Path, rows: tuple[Row, ...], localizer: Localizer
-) -> tuple[Illustration, ...]:
-    """A typical fix and the one with the fewest inliers, localized again to draw their matches."""
+) -> tuple[TimedIllustration, ...]:
+    """Images that are localized again, to draw their matches."""
     from gam_relocalizer.cameras import camera_from_calibration
+    from gam_relocalizer.localization.pictures import Illustration
     from gam_relocalizer.replay.bag import open_bag
     from gam_relocalizer.replay.messages import calibration_in, image_in
-    from gam_relocalizer.replay.result import Illustration
+    from gam_relocalizer.replay.result import TimedIllustration
 
-    fixes = sorted((row for row in rows if row.robot_pose), key=lambda row: row.inliers)
-    middle = len(fixes) // 2
-    stamps = [row.stamp_ns for row in (*fixes[middle : middle + 1], *fixes[:1])]
+    stamps = _stamps_to_show(rows)
     with open_bag(bag) as reader:
         info = next(reader.messages([CAMERA_INFO_TOPIC]))
         images = {
@@ -136,10 +135,24 @@ def _illustrations(
     camera = camera_from_calibration(calibration_in(info), image_is_rectified=False)
     estimates = {stamp: localizer.localize(images[stamp], camera).estimate for stamp in stamps}
     return tuple(
-        Illustration(stamp, images[stamp], camera, estimate)
+        TimedIllustration(stamp, Illustration(images[stamp], camera, estimate))
         for stamp, estimate in estimates.items()
         if estimate is not None
     )
+
+
+def _stamps_to_show(rows: tuple[Row, ...]) -> list[int]:
+    """A typical fix, those with the largest errors, and the refused ones with most inliers."""
+    from gam_relocalizer.replay.replay import REFUSED_SHOWN, WORST_SHOWN
+
+    fixes = [row for row in rows if row.robot_pose]
+    typical = sorted(fixes, key=lambda row: row.inliers)[len(fixes) // 2 :][:1]
+    worst = sorted(fixes, key=lambda row: -row.error.position if row.error else 0.0)
+    refused = sorted(
+        (row for row in rows if not row.robot_pose and row.inliers), key=lambda row: -row.inliers
+    )
+    shown = (*typical, *worst[:WORST_SHOWN], *refused[:REFUSED_SHOWN])
+    return list(dict.fromkeys(row.stamp_ns for row in shown))
 
 
 def _require_success(summary: Summary, log: Path) -> None:

@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from gam_relocalizer import __version__
-from gam_relocalizer.cli import demo, evaluate, localize, node, replay, train
+from gam_relocalizer.cli import augment, demo, evaluate, localize, node, replay, train, view
 from gam_relocalizer.cli import map as map_commands
 from gam_relocalizer.errors import RelocalizerError, UsageError
 
@@ -29,6 +29,8 @@ app = typer.Typer(
 app.add_typer(map_commands.app, name='map')
 app.command()(localize.localize)
 app.command()(replay.replay)
+app.command()(view.view)
+app.command()(augment.augment)
 app.command(
     context_settings={'allow_extra_args': True, 'ignore_unknown_options': True},
 )(node.node)

@@ -127,7 +127,7 @@ def replay(  # noqa: PLR0913 - the options of the command
             rows=rows,
             scene_map=scene_map,
             illustrations=replayed.illustrations,
-            facts={name: str(value) for name, value in facts.items()},
+            facts={name: str(value) for name, value in facts.items() if value is not None},
             trajectories=trajectories,
         )
         write_trajectory(folder, rows)

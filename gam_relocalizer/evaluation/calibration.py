@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from gam_relocalizer.geometry import rotation_of
+from gam_relocalizer.plots import FOUND, WIDTH, finish
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import pycolmap
     from numpy.typing import ArrayLike, NDArray
 
@@ -24,9 +23,6 @@ POSE_FREEDOM = 6
 BAND = 0.95
 GROSS_SIGMA = 10.0
 """A pose so many standard deviations off has a covariance that is worth nothing."""
-
-_COLOUR = '#0b62c4'
-_DPI = 150
 
 
 @dataclass(frozen=True)
@@ -197,7 +193,7 @@ def summarise_nees(nees: ArrayLike) -> NeesSummary:
 
 def reliability_figure(calibration: Calibration) -> Figure:
     """Share correct over confidence, and below how many queries each point stands for."""
-    figure = Figure(figsize=(4.8, 5.4), layout='constrained')
+    figure = Figure(figsize=(WIDTH, 5.4), layout='constrained')
     shares, counts = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     confidences = [one.confidence for one in calibration.bins]
     shares.plot((0, 1), (0, 1), '--', color='0.6', label='calibrated')
@@ -205,31 +201,24 @@ def reliability_figure(calibration: Calibration) -> Figure:
         confidences,
         [one.correct for one in calibration.bins],
         'o-',
-        color=_COLOUR,
+        color=FOUND,
         label='measured',
     )
     shares.set(ylabel='share correct', xlim=(0, 1), ylim=(-0.02, 1.02))
     shares.legend(fontsize=9, loc='lower right')
     for one in calibration.bins:
-        counts.bar(one.low, one.count, one.high - one.low, align='edge', color=_COLOUR)
+        counts.bar(one.low, one.count, one.high - one.low, align='edge', color=FOUND)
     counts.set(xlabel='confidence', ylabel='queries')
     for axes in (shares, counts):
-        axes.grid(alpha=0.3)
+        finish(axes)
     return figure
 
 
 def precision_recall_figure(curve: PrecisionRecall) -> Figure:
     """Precision over recall."""
-    figure = Figure(figsize=(4.8, 4.2), layout='constrained')
+    figure = Figure(figsize=(WIDTH, 4.2), layout='constrained')
     axes = figure.subplots()
-    axes.plot(curve.recall, curve.precision, '.-', color=_COLOUR)
+    axes.plot(curve.recall, curve.precision, '.-', color=FOUND)
     axes.set(xlabel='recall', ylabel='precision', xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    axes.grid(alpha=0.3)
+    finish(axes)
     return figure
-
-
-def write_figure(path: Path, figure: Figure) -> None:
-    """Writes a PNG under a temporary name, then renames it."""
-    temporary = path.with_name(f'.{path.name}.part')
-    figure.savefig(temporary, dpi=_DPI, format='png')
-    temporary.replace(path)

@@ -9,13 +9,18 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from gam_relocalizer import pages
+from gam_relocalizer.evaluation.figures import bars_figure
 from gam_relocalizer.evaluation.matching import TRUE_CANDIDATES, mean_over_maps
 from gam_relocalizer.evaluation.neighbours import curves_of, neighbours_figure
 from gam_relocalizer.geometry import write_text
+from gam_relocalizer.plots import write_picture
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
+
+    from matplotlib.figure import Figure
 
     from gam_relocalizer.evaluation.matching import EvaluationOptions, MapEvaluation, Score
 
@@ -36,10 +41,12 @@ DEFAULT_MATCHERS = tuple(dict.fromkeys(name for names in TABLES.values() for nam
 
 MARKDOWN = 'matching.md'
 JSON = 'matching.json'
+PAGE = 'matching.html'
+SHARES = 'precision_and_recall.png'
 FIGURE = 'neighbours.png'
 
 _KIND = 'gam_relocalizer evaluate matching'
-_DPI = 150
+_TITLE = 'Matching'
 
 
 @dataclass(frozen=True)
@@ -131,14 +138,54 @@ def as_json(report: MatchingReport) -> dict[str, Any]:
 
 
 def write_report(folder: Path, report: MatchingReport) -> None:
-    """Writes the tables, the numbers and, where k was swept, the figure to an existing folder."""
+    """Writes the tables, the numbers, the figures and a page of them all to an existing folder."""
     write_text(folder / MARKDOWN, markdown(report))
     write_text(folder / JSON, json.dumps(as_json(report), indent=2, allow_nan=False) + '\n')
+    figures = _figures(report)
+    for file, (figure, _) in figures.items():
+        write_picture(folder / file, figure)
+    parts = [
+        pages.numbers(_headline(report)),
+        *(pages.picture(figure, caption) for figure, caption in figures.values()),
+        *pages.markdown(markdown(report)),
+    ]
+    write_text(folder / PAGE, pages.page(_TITLE, parts))
+
+
+def _headline(report: MatchingReport) -> dict[str, str]:
+    """Of the last matcher."""
+    last = report.matchers[-1]
+    score = mean_over_maps(report.evaluations)[last]
+    return {
+        'matcher': last,
+        'images': str(sum(one.images for one in report.evaluations)),
+        'precision of its matches': f'{100.0 * score.precision:.1f} %',
+        'true matches that it finds': f'{100.0 * score.recall:.1f} %',
+        'images with a pose': f'{100.0 * score.poses:.1f} %',
+    }
+
+
+def _figures(report: MatchingReport) -> dict[str, tuple[Figure, str]]:
+    """With their captions, by the names of their files."""
+    means = mean_over_maps(report.evaluations)
+    shares = {
+        name: {'precision': means[name].precision, 'recall': means[name].recall}
+        for name in report.matchers
+    }
+    figures = {
+        SHARES: (
+            bars_figure(shares, '[%]'),
+            'Share of the matches that are true, and of the true ones that are found, for each '
+            'matcher: mean over the maps.',
+        )
+    }
     if report.swept is not None:
-        figure = neighbours_figure(curves_of(mean_over_maps(report.evaluations)))
-        temporary = folder / f'.{FIGURE}.part'
-        figure.savefig(temporary, dpi=_DPI, format='png')
-        temporary.replace(folder / FIGURE)
+        figures[FIGURE] = (
+            neighbours_figure(curves_of(means)),
+            f'Candidates from the k nearest neighbours, with and without the ratio, judged by '
+            f'{report.swept}: mean over the maps.',
+        )
+    return figures
 
 
 def _tables(chosen: Sequence[str]) -> dict[str, list[str]]:

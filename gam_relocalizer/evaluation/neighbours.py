@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
+from gam_relocalizer.plots import FOUND, LABEL_SIZE, REFUSED, WIDTH, finish
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 NEIGHBOURS = tuple(range(1, 9))
 # kNN is kNN ratio that keeps every neighbour.
 RATIOS = {'kNN ratio': 0.7, 'kNN': 0.0}
-COLOURS = {'kNN ratio': '#0b62c4', 'kNN': '#d62728'}
+COLOURS = {'kNN ratio': FOUND, 'kNN': REFUSED}
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def curves_of(scores: Mapping[str, Score]) -> dict[str, list[Score]]:
 
 def neighbours_figure(curves: Mapping[str, Sequence[Score]]) -> Figure:
     """Precision and recall on the left, errors of position and rotation on the right."""
-    figure = Figure(figsize=(7.2, 5.4), layout='constrained')
+    figure = Figure(figsize=(1.2 * WIDTH, 5.0), layout='constrained')
     panels: tuple[tuple[str, Callable[[Score], float]], ...] = (
         ('M.Precision [%]', lambda score: 100.0 * score.precision),
         ('MPE [‰ of the depth]', lambda score: score.position_permille),
@@ -68,14 +70,14 @@ def neighbours_figure(curves: Mapping[str, Sequence[Score]]) -> Figure:
     )
     for axes, (title, value) in zip(figure.subplots(2, 2).flat, panels, strict=True):
         _draw(axes, title, {name: [value(one) for one in curve] for name, curve in curves.items()})
-    figure.axes[0].legend(fontsize=9)
+    figure.axes[0].legend(fontsize=LABEL_SIZE)
     return figure
 
 
 def _draw(axes: Axes, title: str, curves: Mapping[str, Sequence[float]]) -> None:
     for label, values in curves.items():
         axes.plot(NEIGHBOURS, values, 'o-', markersize=4, color=COLOURS[label], label=label)
-    axes.set_title(title, fontsize=10)
-    axes.set_xlabel('k', fontsize=9)
+    axes.set_title(title, fontsize=LABEL_SIZE)
+    axes.set_xlabel('k', fontsize=LABEL_SIZE)
     axes.set_xticks(NEIGHBOURS)
-    axes.grid(alpha=0.3)
+    finish(axes)

@@ -20,7 +20,15 @@ from gam_relocalizer import plots
 from gam_relocalizer.errors import UsageError
 from gam_relocalizer.geometry import write_text
 from gam_relocalizer.mapping.coverage import SHARED_POINTS, Standing
-from gam_relocalizer.plots import LABEL_SIZE, POINT, REFERENCE, View, dots, fit_axes, png
+from gam_relocalizer.plots import (
+    LABEL_SIZE,
+    POINT,
+    REFERENCE,
+    View,
+    dots,
+    fit_axes,
+    write_picture,
+)
 from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
@@ -75,13 +83,6 @@ def write_build_report(map_path: Path, report: BuildReport, folder: Path) -> Non
     write_picture(folder / TOP, top_figure(scene_map))
     write_picture(folder / SIDE, side_figure(scene_map))
     write_picture(folder / GRAPH, covisibility_figure(scene_map))
-
-
-def write_picture(file: Path, figure: Figure) -> None:
-    """Writes a PNG under a temporary name, then renames it."""
-    temporary = file.with_name(f'.{file.name}.part')
-    temporary.write_bytes(png(figure))
-    temporary.replace(file)
 
 
 def top_figure(scene_map: SceneMap) -> Figure:

@@ -7,20 +7,29 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.collections import EllipseCollection, PathCollection
+from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 
+from gam_relocalizer.localization.pictures import draw_matches
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.plots import (
+    FOUND,
     LABEL_SIZE,
+    OTHERS,
     POINT,
     REFERENCE,
+    REFUSED,
+    WIDTH,
     View,
     dots,
+    finish,
     fit_axes,
+    fit_figure,
+    legend_below,
     thinned,
     unit_of,
 )
+from gam_relocalizer.replay.summary import position_between
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,61 +39,91 @@ if TYPE_CHECKING:
 
     from gam_relocalizer.geometry import PoseError
     from gam_relocalizer.replay.drift import Trajectories
-    from gam_relocalizer.replay.result import Illustration
+    from gam_relocalizer.replay.result import TimedIllustration
     from gam_relocalizer.replay.summary import Row
     from gam_relocalizer.scene_map import SceneMap
 
-FIX, TRUTH, REFUSED, INLIER, REPROJECTED = '#0b62c4', '#111111', '#d62728', '#2bd34a', '#ff9d00'
-ODOMETRY, CORRECTED = '#f2a33a', '#2ca089'
-STAGE_COLOURS = ('#0b62c4', '#2ca089', '#f2a33a', '#b04fa8', '#777777')
+FIX, TRUTH = FOUND, '#111111'
+ODOMETRY, CORRECTED = OTHERS[1], OTHERS[0]
+STAGE_COLOURS = (FOUND, *OTHERS)
 
 SIGMAS = 3.0
 
+_NO_QUERY, _NOTHING_FOUND = '#777777', OTHERS[1]
+_STATUS_INCHES = 0.32
 
-def trajectory_figure(rows: Sequence[Row], scene_map: SceneMap) -> Figure:
-    """The map from above with the fixes."""
-    figure = Figure(figsize=(6.4, 6.0), layout='constrained')
-    draw_trajectory(figure.subplots(), rows, scene_map)
+
+def trajectory_figure(
+    rows: Sequence[Row], scene_map: SceneMap, view: View, trajectories: Trajectories | None = None
+) -> Figure:
+    """The map with the fixes, seen in one way."""
+    figure = Figure(layout='constrained')
+    draw_trajectory(figure.subplots(), rows, scene_map, view, trajectories)
+    fit_figure(figure)
     return figure
 
 
-def draw_trajectory(axes: Axes, rows: Sequence[Row], scene_map: SceneMap) -> None:
-    """Map points, reference cameras, fixes with their covariances, and the truth, from above."""
-    view = View.from_above(scene_map)
+def draw_trajectory(
+    axes: Axes,
+    rows: Sequence[Row],
+    scene_map: SceneMap,
+    view: View,
+    trajectories: Trajectories | None = None,
+) -> None:
+    """Map points, reference cameras, fixes with their covariances, refused attempts, the truth.
+
+    An attempt that was refused is where the truth says, or else between the fixes around it.
+    """
     points = view.of(thinned(scene_map.points))
-    cameras = view.of(np.array([pose.tgt_origin_in_src() for pose in scene_map.camera_from_map]))
+    cameras = view.of(scene_map.camera_positions)
+    truth = view.of(_true_positions(rows, trajectories))
     fixes = [row.robot_pose for row in rows if row.robot_pose is not None]
     positions = view.of(np.array([fix.map_from_base.translation for fix in fixes]))
-    truth = view.of(np.array([row.truth.translation for row in rows if row.truth is not None]))
     dots(axes, points, s=1.2, c=POINT, alpha=0.5, label='map points')
     dots(axes, cameras, s=7, c=REFERENCE, label='reference images')
     if len(truth):
         axes.plot(*truth.T, '-', color=TRUTH, linewidth=1.0, label='ground truth')
-    axes.plot(*positions.T, '-', color=FIX, linewidth=0.6, alpha=0.5)
-    dots(axes, positions, s=12, c=FIX, zorder=4, label=f'fixes, {SIGMAS:.0f}-sigma')
+    if trajectories is not None and trajectories.corrected:
+        places = np.array([pose.map_from_base.translation for pose in trajectories.corrected])
+        axes.plot(
+            *view.of(places).T, '-', color=CORRECTED, linewidth=1.2, label='corrected odometry'
+        )
+    else:
+        axes.plot(*positions.T, '-', color=FIX, linewidth=0.6, alpha=0.5)
     if fixes:
+        dots(axes, positions, s=12, c=FIX, zorder=4, label=f'fixes, {SIGMAS:.0f}-sigma')
         spreads = [view.axes @ fix.covariance[:3, :3] @ view.axes.T for fix in fixes]
         _draw_ellipses(axes, positions, np.array(spreads))
-    refused = [row.truth for row in rows if row.robot_pose is None and row.truth is not None]
-    if refused:
-        where = view.of(np.array([truth.translation for truth in refused]))
-        dots(
-            axes, where, s=26, c=REFUSED, marker='x', linewidths=1.2, zorder=4,
-            label='refused (at the truth)',
-        )  # fmt: skip
+    refused = view.of(_refused_positions(rows))
+    if len(refused):
+        dots(axes, refused, s=26, c=REFUSED, marker='x', linewidths=1.2, zorder=5, label='refused')
     fit_axes(axes, points, np.concatenate([cameras, positions, truth]))
     axes.set_xlabel(view.labels[0], fontsize=LABEL_SIZE)
     axes.set_ylabel(view.labels[1], fontsize=LABEL_SIZE)
-    legend = axes.legend(loc='upper right', fontsize=8, framealpha=0.9, borderpad=0.5)
-    for handle in legend.legend_handles:
-        if isinstance(handle, PathCollection):
-            handle.set_alpha(1.0)
-            handle.set_sizes([24])
+    legend_below(axes)
+
+
+def _true_positions(rows: Sequence[Row], trajectories: Trajectories | None) -> NDArray[np.float64]:
+    """At the rate of the odometry, if there is any."""
+    truths = [row.truth for row in rows]
+    if trajectories is not None and trajectories.odometry:
+        truths = [pose.truth for pose in trajectories.odometry]
+    return np.array([truth.translation for truth in truths if truth is not None]).reshape(-1, 3)
+
+
+def _refused_positions(rows: Sequence[Row]) -> NDArray[np.float64]:
+    fixes = [(row.stamp_ns, row.robot_pose.map_from_base) for row in rows if row.robot_pose]
+    guesses = [
+        position_between(row.stamp_ns, fixes) if row.truth is None else row.truth.translation
+        for row in rows
+        if row.robot_pose is None
+    ]
+    return np.array([guess for guess in guesses if guess is not None]).reshape(-1, 3)
 
 
 def error_figure(rows: Sequence[Row], unit: str) -> Figure:
     """Errors (where the truth is known) and standard deviations over time."""
-    figure = Figure(figsize=(6.4, 4.8), layout='constrained')
+    figure = Figure(figsize=(WIDTH, 4.8), layout='constrained')
     position, orientation = figure.subplots(2, 1, sharex=True)
     draw_position_errors(position, rows, unit)
     fixes = [row for row in rows if row.robot_pose is not None]
@@ -114,7 +153,7 @@ def draw_position_errors(axes: Axes, rows: Sequence[Row], unit: str) -> None:
 
 def drift_figure(trajectories: Trajectories) -> Figure:
     """Errors of odometry, fixes and corrected odometry over time; the map is metric."""
-    figure = Figure(figsize=(6.4, 4.8), layout='constrained')
+    figure = Figure(figsize=(WIDTH, 4.8), layout='constrained')
     position, orientation = figure.subplots(2, 1, sharex=True)
     draw_drift(position, trajectories, lambda error: 100.0 * error.position)
     draw_drift(orientation, trajectories, lambda error: error.rotation_deg)
@@ -143,7 +182,7 @@ def draw_drift(axes: Axes, trajectories: Trajectories, size: Callable[[PoseError
 
 def inlier_figure(rows: Sequence[Row]) -> Figure:
     """Inliers of every attempt over time."""
-    figure = Figure(figsize=(6.4, 2.8), layout='constrained')
+    figure = Figure(figsize=(WIDTH, 2.6), layout='constrained')
     draw_inliers(figure.subplots(), rows)
     return figure
 
@@ -164,7 +203,7 @@ def draw_inliers(axes: Axes, rows: Sequence[Row]) -> None:
 
 def timing_figure(rows: Sequence[Row]) -> Figure:
     """Milliseconds of every attempt, stage upon stage."""
-    figure = Figure(figsize=(6.4, 2.8), layout='constrained')
+    figure = Figure(figsize=(WIDTH, 3.4), layout='constrained')
     axes = figure.subplots()
     seconds = _seconds(rows, rows)
     width = 0.8 * float(np.min(np.diff(seconds))) if len(seconds) > 1 else 0.8
@@ -177,59 +216,57 @@ def timing_figure(rows: Sequence[Row]) -> Figure:
         floor += height
     axes.set_xlabel('time [s]', fontsize=LABEL_SIZE)
     axes.set_ylabel('time per attempt [ms]', fontsize=LABEL_SIZE)
-    _finish(axes)
+    finish(axes)
+    legend_below(axes)
     return figure
 
 
-def match_figure(illustration: Illustration, scene_map: SceneMap) -> Figure:
-    """An image with the inliers of its pose."""
-    camera = illustration.camera
-    figure = Figure(figsize=(6.4, 6.4 * camera.height / camera.width + 0.35), layout='constrained')
-    draw_matches(figure.subplots(), illustration, scene_map)
+def status_figure(rows: Sequence[Row]) -> Figure:
+    """Every attempt as a mark in the line of its verdict, over time."""
+    statuses = [status for status in Status if any(row.status is status for row in rows)][::-1]
+    figure = Figure(figsize=(WIDTH, 0.8 + _STATUS_INCHES * len(statuses)), layout='constrained')
+    axes = figure.subplots()
+    names = []
+    for line, status in enumerate(statuses):
+        chosen = [row for row in rows if row.status is status]
+        seconds, colour = _seconds(chosen, rows), status_colour(status)
+        axes.scatter(seconds, np.full(len(chosen), line), s=80, c=colour, marker='|', linewidths=2)
+        names.append(f'{status.name} ({len(chosen)})')
+    axes.set_yticks(range(len(statuses)), names)
+    axes.set_ylim(-0.6, len(statuses) - 0.4)
+    axes.set_xlabel('time [s]', fontsize=LABEL_SIZE)
+    finish(axes)
+    for label, status in zip(axes.get_yticklabels(), statuses, strict=True):
+        label.set_color(status_colour(status))
     return figure
 
 
-def draw_matches(axes: Axes, illustration: Illustration, scene_map: SceneMap) -> None:
-    """Inlier keypoints, each tied to the place where the pose puts its map point."""
-    image, camera, estimate = illustration.image, illustration.camera, illustration.estimate
-    height, width = image.shape[:2]
-    # the extent puts pixel centres at +0.5, where COLMAP has them
-    axes.imshow(image, cmap='gray', vmin=0, vmax=255, extent=(0, width, height, 0))
-    keypoints = np.asarray(estimate.inlier_keypoints, dtype=float)
-    in_camera = np.array(
-        [
-            estimate.camera_from_map * point
-            for point in scene_map.positions_of(estimate.inlier_points)
-        ]
-    ).reshape(-1, 3)
-    reprojected = np.asarray(camera.img_from_cam(in_camera)).reshape(-1, 2)
-    residuals = np.stack([keypoints, reprojected]).transpose(2, 0, 1)
-    axes.plot(*residuals, '-', color=REPROJECTED, linewidth=0.8)
-    dots(
-        axes, keypoints, s=16, facecolors='none', edgecolors=INLIER, linewidths=0.9,
-        label=f'{estimate.inliers} inliers',
-    )  # fmt: skip
-    dots(axes, reprojected, s=2.5, c=REPROJECTED, label='map points, reprojected')
-    axes.set_xlim(0, width)
-    axes.set_ylim(height, 0)
-    axes.set_axis_off()
-    axes.legend(loc='lower left', fontsize=8, framealpha=0.85, ncols=2, borderpad=0.4)
+def status_colour(status: Status) -> str:
+    """One for fixes, one for each way to fail: no query, nothing found, found and not believed."""
+    if status is Status.ACCEPTED:
+        return FIX
+    if status.value < Status.TOO_FEW_FEATURES.value:
+        return _NO_QUERY
+    return _NOTHING_FOUND if status.value <= Status.NO_POSE.value else REFUSED
 
 
 def overview_figure(
     title: str,
     rows: Sequence[Row],
     scene_map: SceneMap,
-    illustrations: Sequence[Illustration],
+    illustrations: Sequence[TimedIllustration],
+    trajectories: Trajectories | None = None,
 ) -> Figure:
     """The run in one picture: the map with the trajectory, matches on an image, the errors."""
-    figure = Figure(figsize=(12.0, 6.6), layout='constrained')
+    figure = Figure(figsize=(12.0, 6.8), layout='constrained')
     figure.suptitle(title, fontsize=10.5, linespacing=1.4)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.0), height_ratios=(2.1, 1.0))
-    draw_trajectory(figure.add_subplot(grid[:, 0]), rows, scene_map)
+    draw_trajectory(
+        figure.add_subplot(grid[:, 0]), rows, scene_map, View.from_above(scene_map), trajectories
+    )
     matches = figure.add_subplot(grid[0, 1])
     if illustrations:
-        draw_matches(matches, illustrations[0], scene_map)
+        draw_matches(matches, illustrations[0].illustration, scene_map)
     else:
         matches.text(0.5, 0.5, 'no image was localized', ha='center', va='center')
         matches.set_axis_off()
@@ -248,8 +285,14 @@ def _draw_errors(
     errors: Sequence[float],
     deviations: Sequence[float],
 ) -> None:
-    axes.fill_between(seconds, 0, deviations, color=FIX, alpha=0.15, linewidth=0)
-    axes.plot(seconds, deviations, '-', color=FIX, linewidth=1.0, alpha=0.7, label='1-sigma')
+    """Bands of one and of three standard deviations; errors on top of them."""
+    deviation = np.array(deviations)
+    for sigmas, alpha in ((SIGMAS, 0.13), (1.0, 0.25)):
+        axes.fill_between(
+            seconds, 0, sigmas * deviation, color=FIX, alpha=alpha, linewidth=0,
+            label=f'{sigmas:.0f}-sigma',
+        )  # fmt: skip
+    axes.plot(seconds, deviation, '.', color=FIX, markersize=3)
     if np.isfinite(errors).any():
         axes.plot(seconds, errors, 'o', color=TRUTH, markersize=3.5, label='error')
     axes.set_ylim(bottom=0)
@@ -257,12 +300,10 @@ def _draw_errors(
 
 
 def _finish(axes: Axes) -> None:
-    axes.grid(alpha=0.3, linewidth=0.6)
-    axes.tick_params(labelsize=8)
-    axes.spines[['top', 'right']].set_visible(False)
+    finish(axes)
     if axes.get_legend_handles_labels()[0]:
-        axes.set_ylim(top=1.2 * axes.get_ylim()[1])  # room for the legend
-        axes.legend(fontsize=8, loc='upper right', ncols=4, framealpha=0.9)
+        axes.set_ylim(top=1.25 * axes.get_ylim()[1])  # room for the legend
+        axes.legend(fontsize=LABEL_SIZE, loc='upper right', ncols=4, framealpha=0.9, borderpad=0.3)
 
 
 def _draw_ellipses(

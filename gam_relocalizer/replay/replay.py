@@ -16,6 +16,7 @@ from gam_relocalizer.localization.continuity import (
     ContinuityOptions,
     is_odometry_of,
 )
+from gam_relocalizer.localization.pictures import Foremost, Illustration
 from gam_relocalizer.localization.result import LocalizationResult, Status
 from gam_relocalizer.localization.robot_pose import CovarianceOptions, robot_pose
 from gam_relocalizer.replay.bag import (
@@ -33,7 +34,8 @@ from gam_relocalizer.replay.messages import (
     image_in,
     pose_in,
 )
-from gam_relocalizer.replay.result import Attempt, Illustration, OdometrySample, Replay
+from gam_relocalizer.replay.result import Attempt, OdometrySample, Replay, TimedIllustration
+from gam_relocalizer.replay.summary import row_of
 from gam_relocalizer.transforms import TransformTree
 
 if TYPE_CHECKING:
@@ -53,6 +55,10 @@ TF_STATIC = '/tf_static'
 
 # A transform or odometry for the time of an image may be recorded a little after the image.
 DELAY_NS = NANOSECONDS
+
+# So many images of each kind are kept for pictures.
+WORST_SHOWN = 3
+REFUSED_SHOWN = 3
 
 
 class Localizes(Protocol):
@@ -296,14 +302,15 @@ def _attempt(
         return Attempt(message.stamp_ns, refused, truth=truth)
     prior = continuity.prior(message.stamp_ns, base_from_camera)
     result = localizer.localize(image, camera, prior)
-    if not result.accepted or result.estimate is None:
-        return Attempt(message.stamp_ns, result, truth=truth)
-    pose = robot_pose(result.estimate, base_from_camera, options.covariance)
-    judged = continuity.judge(message.stamp_ns, result, pose)
-    if not judged.accepted:
-        return Attempt(message.stamp_ns, judged, truth=truth)
-    illustrations.consider(Illustration(message.stamp_ns, image, camera, result.estimate))
-    return Attempt(message.stamp_ns, judged, pose, truth)
+    attempt = Attempt(message.stamp_ns, result, truth=truth)
+    if result.estimate is None:
+        return attempt
+    if result.accepted:
+        pose = robot_pose(result.estimate, base_from_camera, options.covariance)
+        judged = continuity.judge(message.stamp_ns, result, pose)
+        attempt = replace(attempt, result=judged, robot_pose=pose if judged.accepted else None)
+    illustrations.consider(attempt, Illustration(image, camera, result.estimate))
+    return attempt
 
 
 _STATUS_OF: dict[type[Exception], Status] = {
@@ -324,20 +331,23 @@ def _base_from_camera(
 
 
 class _Illustrations:
-    """Remembers the images with the most and the fewest inliers, and no other."""
+    """Remembers a few images and no other: the best one, the worst ones, and refused ones."""
 
     def __init__(self) -> None:
-        self._best: Illustration | None = None
-        self._worst: Illustration | None = None
+        self._best = Foremost[TimedIllustration](1)
+        self._worst = Foremost[TimedIllustration](WORST_SHOWN)
+        self._refused = Foremost[TimedIllustration](REFUSED_SHOWN)
 
-    def consider(self, candidate: Illustration) -> None:
-        inliers = candidate.estimate.inliers
-        if self._best is None or inliers > self._best.estimate.inliers:
-            self._best = candidate
-        if self._worst is None or inliers < self._worst.estimate.inliers:
-            self._worst = candidate
+    def consider(self, attempt: Attempt, illustration: Illustration) -> None:
+        timed = TimedIllustration(attempt.stamp_ns, illustration)
+        error, inliers = row_of(attempt).error, illustration.estimate.inliers
+        if attempt.robot_pose is None:
+            self._refused.consider(timed, inliers)
+            return
+        self._best.consider(timed, inliers)
+        # where the truth is known, the error tells more than the inliers
+        self._worst.consider(timed, -1.0 if error is None else error.position, -inliers)
 
-    def chosen(self) -> tuple[Illustration, ...]:
-        if self._best is None or self._worst is None:
-            return ()
-        return (self._best,) if self._best is self._worst else (self._best, self._worst)
+    def chosen(self) -> tuple[TimedIllustration, ...]:
+        every = (*self._best.items, *self._worst.items, *self._refused.items)
+        return tuple({timed.stamp_ns: timed for timed in every}.values())

@@ -4,20 +4,21 @@
 
 from __future__ import annotations
 
-import base64
 from dataclasses import dataclass, field
-from html import escape
 from typing import TYPE_CHECKING
 
 from gam_relocalizer.geometry import write_text
+from gam_relocalizer.localization.pictures import MATCHES_EXPLAINED, match_figure
 from gam_relocalizer.localization.result import Status
-from gam_relocalizer.plots import png, unit_of
+from gam_relocalizer.pages import heading, numbers, page, paragraph, picture, table
+from gam_relocalizer.plots import View, unit_of, write_picture
 from gam_relocalizer.replay.figures import (
+    SIGMAS,
     drift_figure,
     error_figure,
     inlier_figure,
-    match_figure,
     overview_figure,
+    status_figure,
     timing_figure,
     trajectory_figure,
 )
@@ -27,32 +28,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from matplotlib.figure import Figure
-
     from gam_relocalizer.replay.drift import Trajectories
-    from gam_relocalizer.replay.result import Illustration
+    from gam_relocalizer.replay.result import TimedIllustration
     from gam_relocalizer.replay.summary import Row, Spread
     from gam_relocalizer.scene_map import SceneMap
 
 REPORT = 'report.html'
 OVERVIEW = 'overview.png'
-
-_STYLE = """
-:root { color-scheme: light; }
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 0 auto; padding: 1rem;
-       color: #1c2530; }
-h1 { font-size: 1.5rem; margin: 0.5rem 0; } h2 { font-size: 1.15rem; margin: 2rem 0 0.5rem; }
-img { max-width: 100%; height: auto; display: block; }
-figure { margin: 0.5rem 0; } figcaption { color: #55606e; font-size: 0.9rem; }
-.numbers { display: flex; flex-wrap: wrap; gap: 0.6rem; padding: 0; list-style: none; }
-.numbers li { background: #eef2f7; border-radius: 0.5rem; padding: 0.5rem 0.8rem; }
-.numbers b { display: block; font-size: 1.3rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: 0.85rem; white-space: nowrap; }
-th, td { padding: 0.25rem 0.6rem; text-align: right; border-bottom: 1px solid #dde3ea; }
-th:nth-child(2), td:nth-child(2), td:last-child, th:last-child { text-align: left; }
-tr.refused td { background: #fdeeee; }
-"""
 
 
 @dataclass(frozen=True)
@@ -63,7 +45,8 @@ class Report:
         title: Its heading.
         rows: One per attempt, in the order of their stamps.
         scene_map: The map.
-        illustrations: Images whose matches are drawn; the first is on the overview, too.
+        illustrations: Images whose matches are drawn, each of one of the rows; the first is on the
+            overview, too.
         facts: What was run, by name: bag, map, options.
         trajectories: Odometry, fixes and corrected odometry, when there was odometry.
     """
@@ -71,7 +54,7 @@ class Report:
     title: str
     rows: Sequence[Row]
     scene_map: SceneMap
-    illustrations: Sequence[Illustration] = ()
+    illustrations: Sequence[TimedIllustration] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     trajectories: Trajectories | None = None
 
@@ -83,39 +66,31 @@ class Report:
 
 def write_report(folder: Path, report: Report) -> None:
     """Writes `report.html` and `overview.png` into an existing folder."""
-    numbers = [f'{name}: {value}' for name, value in headline_numbers(report).items()]
-    title = f'{report.title}\n{"   |   ".join(numbers)}'
-    overview = overview_figure(title, report.rows, report.scene_map, report.illustrations)
-    (folder / OVERVIEW).write_bytes(png(overview))
+    headline = [f'{name}: {value}' for name, value in headline_numbers(report).items()]
+    title = f'{report.title}\n{"   |   ".join(headline)}'
+    overview = overview_figure(
+        title, report.rows, report.scene_map, report.illustrations, report.trajectories
+    )
+    write_picture(folder / OVERVIEW, overview)
     write_text(folder / REPORT, report_html(report))
 
 
 def report_html(report: Report) -> str:
     """The report as an HTML page without scripts and without anything to load."""
-    title = escape(report.title)
-    return '\n'.join(
-        [
-            '<!DOCTYPE html>',
-            '<html lang="en">',
-            '<head>',
-            '<meta charset="utf-8">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f'<title>{title}</title>',
-            f'<style>{_STYLE}</style>',
-            '</head>',
-            '<body>',
-            f'<h1>{title}</h1>',
-            *_numbers(report),
-            *_figures(report),
-            *_drift(report),
-            *_statuses(report),
-            *_attempts(report),
-            *_facts(report),
-            '</body>',
-            '</html>',
-            '',
+    parts = [numbers(headline_numbers(report))]
+    if report.rows:
+        parts += [
+            *_map_parts(report),
+            *_time_parts(report),
+            *_drift_parts(report),
+            *_match_parts(report),
+            *_verdict_parts(report),
+            *_attempt_parts(report),
         ]
-    )
+    else:
+        parts.append(paragraph('No image was tried: the bag has none on this topic.'))
+    parts += [heading('What was run'), table(['', 'value'], list(report.facts.items()))]
+    return page(report.title, parts)
 
 
 def length_text(length: float, unit: str) -> str:
@@ -154,33 +129,52 @@ def headline_numbers(report: Report) -> dict[str, str]:
     return numbers
 
 
-def _numbers(report: Report) -> Iterator[str]:
-    yield '<ul class="numbers">'
-    for name, value in headline_numbers(report).items():
-        yield f'<li><b>{escape(value)}</b>{escape(name)}</li>'
-    yield '</ul>'
+def _map_parts(report: Report) -> Iterator[str]:
+    above, side = View.from_above(report.scene_map), View.from_the_side(report.scene_map)
+    ellipses = (
+        f'Ellipses: {SIGMAS:.0f} standard deviations of the fixes. Refused attempts are where the '
+        f'truth says, or between the fixes before and after.'
+    )
+    yield heading('From above and from the side')
+    for view, caption in (
+        (above, f'The map and the drive. {ellipses}'),
+        (side, 'The same, upright.'),
+    ):
+        figure = trajectory_figure(report.rows, report.scene_map, view, report.trajectories)
+        yield picture(figure, caption)
 
 
-def _figures(report: Report) -> Iterator[str]:
-    if not report.rows:
-        yield '<p>No image was tried: the bag has none on this topic.</p>'
-        return
-    yield '<h2>From above</h2>'
-    yield _image(trajectory_figure(report.rows, report.scene_map), 'The map and the fixes.')
-    for illustration in report.illustrations:
-        inliers = illustration.estimate.inliers
-        caption = (
-            f'Image {illustration.stamp_ns / 1e9:.3f} s, {inliers} inliers. Circles: keypoints; '
-            f'dots: where the pose puts their map points.'
-        )
-        yield '<h2>Matches</h2>'
-        yield _image(match_figure(illustration, report.scene_map), caption)
-    yield '<h2>Over time</h2>'
+def _time_parts(report: Report) -> Iterator[str]:
+    yield heading('Over time')
     if any(row.robot_pose for row in report.rows):
-        caption = 'Errors of the fixes and their own standard deviations.'
-        yield _image(error_figure(report.rows, report.unit), caption)
-    yield _image(inlier_figure(report.rows), 'Inliers of each attempt.')
-    yield _image(timing_figure(report.rows), 'Time of each attempt by stage.')
+        caption = (
+            'Position and orientation of the fixes: how far off they say they may be (bands of 1 '
+            'and 3 standard deviations)'
+        )
+        known = any(row.error for row in report.rows)
+        caption += ', and how far off they are (dots).' if known else '; the truth is not known.'
+        yield picture(error_figure(report.rows, report.unit), caption)
+    yield picture(inlier_figure(report.rows), 'Inliers of each attempt, those of refused ones too.')
+    caption = 'The verdict on each attempt; how often each came is behind its name.'
+    yield picture(status_figure(report.rows), caption)
+    yield picture(timing_figure(report.rows), 'Time of each attempt by stage.')
+
+
+def _match_parts(report: Report) -> Iterator[str]:
+    """The images, each with what became of it."""
+    rows = {row.stamp_ns: row for row in report.rows}
+    for index, timed in enumerate(report.illustrations):
+        if index == 0:
+            yield heading('Matches: a good image, the worst fixes, refused attempts')
+            yield paragraph(MATCHES_EXPLAINED)
+        row = rows[timed.stamp_ns]
+        words = [f'{_time_text(row, report)} s', row.status.name]
+        if error := row.error:
+            error_text = _error_text(error.position, error.rotation_deg, report.unit)
+            words.append(f'error {error_text}')
+        if row.status is not Status.ACCEPTED:
+            words.append(row.reason)
+        yield picture(match_figure(timed.illustration, report.scene_map), ', '.join(words))
 
 
 def trajectory_errors(report: Report) -> list[tuple[str, ...]]:
@@ -206,77 +200,58 @@ def _error_text(position: float, rotation_deg: float, unit: str) -> str:
     return f'{length_text(position, unit)}, {rotation_deg:.2f}°'
 
 
-def _drift(report: Report) -> Iterator[str]:
-    table = trajectory_errors(report)
-    if report.trajectories is None or not table:
+def _drift_parts(report: Report) -> Iterator[str]:
+    errors = trajectory_errors(report)
+    if report.trajectories is None or not errors:
         return
-    yield '<h2>Drift correction</h2>'
+    yield heading('Drift correction')
     caption = (
         'Errors of the odometry by itself, laid on the truth at its start; of the fixes; and of '
         'the odometry as corrected by them, each fix from the time of its image on.'
     )
-    yield _image(drift_figure(report.trajectories), caption)
-    yield from _table(table[0], table[1:])
+    yield picture(drift_figure(report.trajectories), caption)
+    yield table(errors[0], errors[1:])
 
 
-def _image(figure: Figure, caption: str) -> str:
-    data, text = base64.b64encode(png(figure)).decode('ascii'), escape(caption)
-    return (
-        f'<figure><img alt="{text}" src="data:image/png;base64,{data}">'
-        f'<figcaption>{text}</figcaption></figure>'
-    )
-
-
-def _statuses(report: Report) -> Iterator[str]:
+def _verdict_parts(report: Report) -> Iterator[str]:
     summary = summarise(report.rows)
-    yield '<h2>Verdicts and times</h2>'
-    yield from _table(
-        ['verdict', 'attempts'], [(name, str(n)) for name, n in summary.statuses.items()]
-    )
+    yield heading('Verdicts and times')
+    yield table(['verdict', 'attempts'], [(name, str(n)) for name, n in summary.statuses.items()])
     spreads = dict(summary.milliseconds)
     if summary.total_milliseconds:
         spreads['all'] = summary.total_milliseconds
-    yield from _table(
-        ['stage', 'median [ms]', '95 % [ms]', 'max [ms]'],
-        [(stage, *_milliseconds(spread)) for stage, spread in spreads.items()],
-    )
+    if spreads:
+        yield table(
+            ['stage', 'median [ms]', '95 % [ms]', 'max [ms]'],
+            [(stage, *_milliseconds(spread)) for stage, spread in spreads.items()],
+        )
 
 
 def _milliseconds(spread: Spread) -> tuple[str, str, str]:
     return f'{spread.median:.1f}', f'{spread.p95:.1f}', f'{spread.max:.1f}'
 
 
-def _attempts(report: Report) -> Iterator[str]:
-    yield '<h2>Attempts</h2>'
-    header = ['stamp [s]', 'verdict', 'inliers', '1-sigma', 'error', 'ms', 'reason']
-    refused = [row.status is not Status.ACCEPTED for row in report.rows]
-    yield from _table(header, [_cells(row, report.unit) for row in report.rows], refused)
+def _attempt_parts(report: Report) -> Iterator[str]:
+    yield heading('Attempts')
+    header = ['time [s]', 'verdict', 'inliers', 'error', '1-sigma', 'ms', 'reason', 'stamp [s]']
+    refused = [at for at, row in enumerate(report.rows) if row.status is not Status.ACCEPTED]
+    yield table(header, [_cells(row, report) for row in report.rows], refused)
 
 
-def _cells(row: Row, unit: str) -> tuple[str, ...]:
+def _cells(row: Row, report: Report) -> tuple[str, ...]:
     error, deviation = row.error, row.position_std
     return (
-        f'{row.stamp_ns / 1e9:.3f}',
+        _time_text(row, report),
         row.status.name,
         str(row.inliers),
-        '' if deviation is None else length_text(deviation, unit),
-        '' if error is None else _error_text(error.position, error.rotation_deg, unit),
+        '' if error is None else _error_text(error.position, error.rotation_deg, report.unit),
+        '' if deviation is None else length_text(deviation, report.unit),
         f'{row.total_milliseconds:.0f}',
         row.reason,
+        f'{row.stamp_ns / 1e9:.3f}',
     )
 
 
-def _facts(report: Report) -> Iterator[str]:
-    yield '<h2>What was run</h2>'
-    yield from _table(['', 'value'], list(report.facts.items()))
-
-
-def _table(
-    header: Sequence[str], rows: Sequence[Sequence[str]], refused: Sequence[bool] = ()
-) -> Iterator[str]:
-    yield '<div class="wide"><table>'
-    yield f'<tr>{"".join(f"<th>{escape(name)}</th>" for name in header)}</tr>'
-    for index, cells in enumerate(rows):
-        mark = ' class="refused"' if index < len(refused) and refused[index] else ''
-        yield f'<tr{mark}>{"".join(f"<td>{escape(cell)}</td>" for cell in cells)}</tr>'
-    yield '</table></div>'
+def _time_text(row: Row, report: Report) -> str:
+    """As on the axes of the figures: since the first attempt."""
+    return f'{(row.stamp_ns - report.rows[0].stamp_ns) / 1e9:.1f}'

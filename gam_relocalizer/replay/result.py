@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    import numpy as np
     import pycolmap
-    from numpy.typing import NDArray
 
     from gam_relocalizer.localization.correction import Correction
-    from gam_relocalizer.localization.result import LocalizationResult, PoseEstimate
+    from gam_relocalizer.localization.pictures import Illustration
+    from gam_relocalizer.localization.result import LocalizationResult
     from gam_relocalizer.localization.robot_pose import RobotPose
 
 
@@ -52,20 +51,16 @@ class OdometrySample:
 
 
 @dataclass(frozen=True)
-class Illustration:
-    """An image with the pose found for it, for a picture of its matches.
+class TimedIllustration:
+    """An image of a drive with the best pose found for it.
 
     Attributes:
         stamp_ns: Stamp of the image [ns].
-        image: RGB [H,W,3] or grey [H,W].
-        camera: The camera that took it.
-        estimate: The pose, with its inliers.
+        illustration: Image and pose.
     """
 
     stamp_ns: int
-    image: NDArray[np.uint8]
-    camera: pycolmap.Camera
-    estimate: PoseEstimate
+    illustration: Illustration
 
 
 @dataclass(frozen=True)
@@ -76,8 +71,8 @@ class Replay:
         attempts: In the order of their stamps, which strictly increase.
         image_topic: Where the images came from.
         images: Number of images there.
-        illustrations: The accepted images with the most and the fewest inliers, in this order;
-            one when they are the same, none when nothing was accepted.
+        illustrations: A few images with a pose: the accepted one with the most inliers, then those
+            that went worst, then refused ones.
         odometry: In the order of its stamps, which strictly increase; empty without its topic, and
             for a map that is not metric.
     """
@@ -85,5 +80,5 @@ class Replay:
     attempts: tuple[Attempt, ...]
     image_topic: str
     images: int
-    illustrations: tuple[Illustration, ...]
+    illustrations: tuple[TimedIllustration, ...]
     odometry: tuple[OdometrySample, ...] = ()

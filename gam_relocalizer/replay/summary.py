@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     import pycolmap
+    from numpy.typing import NDArray
 
     from gam_relocalizer.localization.result import Timings
     from gam_relocalizer.localization.robot_pose import RobotPose
@@ -145,10 +146,28 @@ def summarise(rows: Sequence[Row]) -> Summary:
     )
 
 
+def position_between(
+    stamp_ns: int, poses: Sequence[tuple[int, pycolmap.Rigid3d]]
+) -> NDArray[np.float64] | None:
+    """[3] between the poses before and after, by time; None when there are no poses.
+
+    Args:
+        stamp_ns: When [ns].
+        poses: map_from_base by rising stamps [ns].
+    """
+    if not poses:
+        return None
+    begin_ns = poses[0][0]  # seconds since then are exact enough, stamps as floats are not
+    seconds = [(stamp - begin_ns) / 1e9 for stamp, _ in poses]
+    places = np.array([pose.translation for _, pose in poses])
+    return np.array([np.interp((stamp_ns - begin_ns) / 1e9, seconds, axis) for axis in places.T])
+
+
 def _by_stage(timings: Timings) -> dict[str, float]:
     return {
         'extraction': timings.extraction,
         'retrieval': timings.retrieval,
         'matching': timings.matching,
         'pose': timings.pose,
+        'verdict': timings.verdict,
     }

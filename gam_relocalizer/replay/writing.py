@@ -4,8 +4,9 @@
 
 `poses.tum` has a line `timestamp tx ty tz qx qy qz qw` of map_from_base for every fix, `fixes.mcap`
 the same with covariances as the node publishes it, `attempts.csv` the verdict on every image that
-was tried, `corrected.tum` the odometry as corrected by the fixes, `summary.json` the numbers,
-`report.html` the pictures and all attempts, `overview.png` the run in one picture.
+was tried, its error where the truth is known, and its time, `corrected.tum` the odometry as
+corrected by the fixes, `summary.json` the numbers, `report.html` the pictures and all attempts,
+`overview.png` the run in one picture.
 """
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ POSES = 'poses.tum'
 CORRECTED = 'corrected.tum'
 FIXES = 'fixes.mcap'
 ATTEMPTS = 'attempts.csv'
-ATTEMPT_COLUMNS = ('stamp_ns', 'status', 'inliers', 'reason')
+ATTEMPT_COLUMNS = (
+    'stamp_ns', 'status', 'inliers', 'reason', 'position_error', 'rotation_error_deg',
+    'milliseconds',
+)  # fmt: skip
 SUMMARY = 'summary.json'
 FIX_TOPIC = '/relocalized_pose'
 
@@ -128,11 +132,14 @@ def write_corrected(folder: Path, trajectories: Trajectories) -> None:
 
 
 def write_attempts(folder: Path, rows: Sequence[Row]) -> None:
-    """Writes `attempts.csv`: the verdict on every image that was tried."""
+    """Writes `attempts.csv`: the verdict on every image that was tried.
+
+    Errors [map units, deg] are empty where there is no fix or no truth.
+    """
     stream = StringIO()
     table = csv.writer(stream, lineterminator='\n')
     table.writerow(ATTEMPT_COLUMNS)
-    table.writerows([row.stamp_ns, row.status.name, row.inliers, row.reason] for row in rows)
+    table.writerows(map(_attempt_cells, rows))
     write_text(folder / ATTEMPTS, stream.getvalue())
 
 
@@ -186,6 +193,13 @@ def _is_replay(out: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(content, dict) and content.get('kind') == _KIND
+
+
+def _attempt_cells(row: Row) -> list[int | str]:
+    error = row.error
+    errors = ['', ''] if error is None else [f'{error.position:.6f}', f'{error.rotation_deg:.6f}']
+    milliseconds = f'{row.total_milliseconds:.1f}'
+    return [row.stamp_ns, row.status.name, row.inliers, row.reason, *errors, milliseconds]
 
 
 def _fixes(rows: Sequence[Row]) -> Iterator[tuple[int, RobotPose]]:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gam_relocalizer.errors import UsageError
-from gam_relocalizer.geometry import rigid3d_from
+from gam_relocalizer.geometry import PoseError, rigid3d_from
 from gam_relocalizer.localization.result import Status
-from gam_relocalizer.replay.bag import NANOSECONDS
+from gam_relocalizer.replay.summary import position_between
 from gam_relocalizer.replay.writing import ATTEMPT_COLUMNS, ATTEMPTS, POSES, SUMMARY
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ class DriveAttempt:
         reason: The verdict in words.
         inliers: Of the best pose found.
         map_from_base: The fix, when accepted.
+        error: Of the fix, where the truth is known.
     """
 
     stamp_ns: int
@@ -46,6 +47,7 @@ class DriveAttempt:
     reason: str
     inliers: int
     map_from_base: pycolmap.Rigid3d | None
+    error: PoseError | None = None
 
 
 @dataclass(frozen=True)
@@ -68,13 +70,7 @@ class Drive:
     def guessed_position(self, stamp_ns: int) -> NDArray[np.float64] | None:
         """[3] between the fixes before and after, by time; nothing in a drive without any."""
         fixes = [(one.stamp_ns, one.map_from_base) for one in self.attempts if one.map_from_base]
-        if not fixes:
-            return None
-        begin = fixes[0][0]  # seconds since then are exact enough, stamps as floats are not
-        seconds = [(stamp - begin) / NANOSECONDS for stamp, _ in fixes]
-        places = np.array([pose.translation for _, pose in fixes])
-        now = (stamp_ns - begin) / NANOSECONDS
-        return np.array([np.interp(now, seconds, axis) for axis in places.T])
+        return position_between(stamp_ns, fixes)
 
 
 def read_drive(folder: Path) -> Drive:
@@ -131,4 +127,10 @@ def _attempt(line: dict[str, str], poses: dict[int, pycolmap.Rigid3d]) -> DriveA
         reason=line['reason'],
         inliers=int(line['inliers']),
         map_from_base=poses[stamp_ns] if status is Status.ACCEPTED else None,
+        error=_error(line),
     )
+
+
+def _error(line: dict[str, str]) -> PoseError | None:
+    position, rotation_deg = line['position_error'], line['rotation_error_deg']
+    return PoseError(float(position), float(rotation_deg)) if position else None

@@ -3,7 +3,8 @@
 """A map as a recording of rerun: points, reference cameras, covisibility, and a replayed drive.
 
 Entities: `map/points`, `map/images/<name>`, `map/covisibility`; `drive/trajectory`, `drive/fix`,
-`drive/refused`, `drive/verdict`, `drive/inliers`, these over the timeline `stamp`.
+`drive/refused`, `drive/verdict`, `drive/inliers`, and `drive/error/position` and
+`drive/error/rotation_deg` where the truth is known, these over the timeline `stamp`.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ APPLICATION = 'gam_relocalizer'
 POINTS, IMAGES, COVISIBILITY = 'map/points', 'map/images', 'map/covisibility'
 TRAJECTORY, FIX, REFUSED = 'drive/trajectory', 'drive/fix', 'drive/refused'
 VERDICT, INLIERS = 'drive/verdict', 'drive/inliers'
+ERROR = 'drive/error'
+POSITION_ERROR, ROTATION_ERROR = f'{ERROR}/position', f'{ERROR}/rotation_deg'
 TIMELINE = 'stamp'
 # What a laptop turns smoothly.
 MAX_POINTS = 500_000
@@ -80,7 +83,7 @@ def write_recording(file: Path, scene_map: SceneMap, drive: Drive | None = None)
     temporary = file.with_name(f'.{file.name}.part')
     recording = rerun.RecordingStream(APPLICATION, recording_id=scene_map.manifest.map_id)
     try:
-        recording.save(temporary, default_blueprint=_blueprint(rerun, with_drive=drive is not None))
+        recording.save(temporary, default_blueprint=_blueprint(rerun, drive))
     except RuntimeError as err:
         msg = f'{file}: cannot be written: {err}'
         raise UsageError(msg) from err
@@ -94,18 +97,22 @@ def write_recording(file: Path, scene_map: SceneMap, drive: Drive | None = None)
         temporary.unlink(missing_ok=True)
 
 
-def _blueprint(rerun: Any, *, with_drive: bool) -> Any:  # noqa: ANN401 - rerun comes on demand
+def _blueprint(rerun: Any, drive: Drive | None) -> Any:  # noqa: ANN401 - rerun comes on demand
     """What is shown where: the 3D view, and beside it what happened over time."""
     blueprint = rerun.blueprint
     scene = blueprint.Spatial3DView(origin='/', name='map')
-    if not with_drive:
+    if drive is None:
         return blueprint.Blueprint(scene, collapse_panels=True)
-    over_time = blueprint.Vertical(
-        blueprint.TimeSeriesView(origin=INLIERS, name='inliers'),
-        blueprint.TextLogView(origin=VERDICT, name='verdicts'),
-    )
+    over_time = [blueprint.TimeSeriesView(origin=INLIERS, name='inliers')]
+    if any(one.error for one in drive.attempts):
+        over_time += [
+            blueprint.TimeSeriesView(origin=POSITION_ERROR, name='position error'),
+            blueprint.TimeSeriesView(origin=ROTATION_ERROR, name='rotation error [deg]'),
+        ]
+    over_time.append(blueprint.TextLogView(origin=VERDICT, name='verdicts'))
     return blueprint.Blueprint(
-        blueprint.Horizontal(scene, over_time, column_shares=[3, 1]), collapse_panels=True
+        blueprint.Horizontal(scene, blueprint.Vertical(*over_time), column_shares=[3, 1]),
+        collapse_panels=True,
     )
 
 
@@ -225,6 +232,9 @@ def _record_drive(rerun: Any, recording: Any, drive: Drive) -> None:  # noqa: AN
     for attempt in drive.attempts:
         recording.set_time(TIMELINE, timestamp=np.datetime64(attempt.stamp_ns, 'ns'))
         recording.log(INLIERS, rerun.Scalars(attempt.inliers))
+        if attempt.error is not None:
+            recording.log(POSITION_ERROR, rerun.Scalars(attempt.error.position))
+            recording.log(ROTATION_ERROR, rerun.Scalars(attempt.error.rotation_deg))
         if attempt.map_from_base is not None:
             place = attempt.map_from_base
             recording.log(

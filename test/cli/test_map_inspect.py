@@ -1,13 +1,11 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""`map info`, `map check` and `map view`."""
+"""`map info` and `map check`."""
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -234,21 +232,6 @@ def test_check_with_a_file_in_place_of_a_folder_is_a_usage_error(
     assert isinstance(run('check', str(path), '--out', str(tmp_path / 'out')).exception, UsageError)
 
 
-def test_view_saves_a_recording_of_every_point(path: Path, tmp_path: Path) -> None:
-    chunks = pytest.importorskip('rerun.chunk', reason='the extra `view` is not installed')
-
-    done = run('view', str(path), '--save', str(tmp_path / 'map.rrd'))
-
-    assert done.exit_code == 0
-    (points,) = [
-        chunk.to_record_batch().column('Points3D:positions').to_pylist()[0]
-        for chunk in chunks.RrdReader(str(tmp_path / 'map.rrd')).stream()
-        if chunk.entity_path == '/map/points'
-    ]
-    np.testing.assert_allclose(points, load_map(path).points, rtol=1e-5, atol=1e-6)
-    assert [file.name for file in tmp_path.iterdir()] == ['map.rrd']
-
-
 @pytest.mark.parametrize('options', [['--every', '3'], ['--global-weights', 'weights.mat']])
 def test_check_refuses_options_that_nothing_follows_from(path: Path, options: list[str]) -> None:
     assert isinstance(run('check', str(path), *options).exception, UsageError)
@@ -258,37 +241,5 @@ def test_check_refuses_a_folder_below_a_file(path: Path, tmp_path: Path) -> None
     (tmp_path / 'file').touch()
 
     done = run('check', str(path), '--out', str(tmp_path / 'file' / 'deeper' / 'out'))
-
-    assert isinstance(done.exception, UsageError)
-
-
-@pytest.mark.parametrize('name', ['pipe', 'folder', 'nosuch/map.rrd'])
-def test_view_does_not_replace_what_is_no_file(path: Path, tmp_path: Path, name: str) -> None:
-    pytest.importorskip('rerun', reason='the extra `view` is not installed')
-    os.mkfifo(tmp_path / 'pipe')
-    (tmp_path / 'folder').mkdir()
-
-    done = run('view', str(path), '--save', str(tmp_path / name))
-
-    assert isinstance(done.exception, UsageError)
-    assert (tmp_path / 'pipe').is_fifo()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ['folder', 'pipe']
-
-
-def test_view_without_the_viewer_tells_how_to_get_it(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, 'rerun', None)
-
-    done = run('view', str(path), '--save', str(tmp_path / 'map.rrd'))
-
-    assert isinstance(done.exception, UsageError)
-    assert 'gam_relocalizer[view]' in str(done.exception)
-
-
-def test_view_of_something_else_than_a_replay_is_a_usage_error(path: Path, tmp_path: Path) -> None:
-    pytest.importorskip('rerun', reason='the extra `view` is not installed')
-
-    done = run('view', str(path), '--replay', str(tmp_path), '--save', str(tmp_path / 'map.rrd'))
 
     assert isinstance(done.exception, UsageError)

@@ -19,8 +19,8 @@ from gam_relocalizer.evaluation.calibration import (
     precision_recall_figure,
     reliability_figure,
     summarise_nees,
-    write_figure,
 )
+from gam_relocalizer.plots import write_picture
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -171,6 +171,6 @@ def test_figure_of_precision_over_recall_is_written_whole(tmp_path: Path) -> Non
     (line,) = figure.axes[0].lines
     np.testing.assert_allclose(line.get_xdata(), [0.5, 0.5])
     np.testing.assert_allclose(line.get_ydata(), [1.0, 0.5])
-    write_figure(tmp_path / 'curve.png', figure)
+    write_picture(tmp_path / 'curve.png', figure)
     assert [path.name for path in tmp_path.iterdir()] == ['curve.png']
     assert (tmp_path / 'curve.png').read_bytes().startswith(b'\x89PNG')

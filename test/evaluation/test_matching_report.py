@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import math
+from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,8 @@ from gam_relocalizer.evaluation.matching_report import (
     FIGURE,
     JSON,
     MARKDOWN,
+    PAGE,
+    SHARES,
     MatchingReport,
     as_json,
     markdown,
@@ -193,7 +196,9 @@ def test_figure_has_the_panels_of_the_paper() -> None:
 def test_writes_files_and_nothing_else(tmp_path: Path) -> None:
     report = report_of(swept_evaluation(), swept='bmnet')
     write_report(tmp_path, report)
-    assert {path.name for path in tmp_path.iterdir()} == {MARKDOWN, JSON, FIGURE}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        MARKDOWN, JSON, PAGE, SHARES, FIGURE,
+    }  # fmt: skip
     assert (tmp_path / MARKDOWN).read_text() == markdown(report)
     content = json.loads((tmp_path / JSON).read_text())
     assert content == as_json(report)
@@ -203,6 +208,19 @@ def test_writes_files_and_nothing_else(tmp_path: Path) -> None:
     assert (tmp_path / FIGURE).read_bytes().startswith(b'\x89PNG')
 
 
+def test_page_tells_what_is_printed(tmp_path: Path) -> None:
+    report = report_of(swept_evaluation(), swept='bmnet')
+    write_report(tmp_path, report)
+    text = (tmp_path / PAGE).read_text(encoding='utf-8')
+    assert text.count('<img') == 2
+    for line in markdown(report).splitlines():
+        if line.startswith('| '):
+            for cell in line.strip('|').split('|'):
+                assert f'>{escape(cell.strip().strip("*"))}<' in text
+
+
 def test_figure_needs_a_sweep(tmp_path: Path) -> None:
     write_report(tmp_path, report_of(evaluation('metric', {'gam': score(0.5, 0.1)})))
-    assert {path.name for path in tmp_path.iterdir()} == {MARKDOWN, JSON}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        MARKDOWN, JSON, PAGE, SHARES,
+    }  # fmt: skip

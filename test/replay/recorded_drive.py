@@ -75,7 +75,10 @@ def grey_image(index: int) -> NDArray[np.uint8]:
 
 @dataclass
 class KnowingLocalizer:
-    """Reads the index of an image from its pixels and answers with the truth, but for mistakes."""
+    """Reads the index of an image from its pixels and answers with the truth, but for mistakes.
+
+    It finds no pose for the images to refuse, and does not believe in those to doubt.
+    """
 
     points: NDArray[np.float64]
     refuse: Sequence[int] = ()
@@ -83,6 +86,7 @@ class KnowingLocalizer:
     cameras: list[pycolmap.Camera] = field(default_factory=list)
     priors: list[Prior | None] = field(default_factory=list)
     mistaken: dict[int, int] = field(default_factory=dict)
+    doubt: Sequence[int] = ()
 
     def localize(
         self, image: NDArray[np.uint8], camera: pycolmap.Camera, prior: Prior | None = None
@@ -96,6 +100,9 @@ class KnowingLocalizer:
             reason = '3 inliers; needs 20 <inliers>'
             return LocalizationResult(Status.TOO_FEW_INLIERS, reason, timings=timings)
         estimate = estimate_at(self.mistaken.get(index, index), camera, self.points)
+        if index in self.doubt:
+            reason = 'two places look & match alike'
+            return LocalizationResult(Status.AMBIGUOUS, reason, estimate, timings=timings)
         return LocalizationResult(Status.ACCEPTED, 'good', estimate, timings=timings)
 
 

@@ -55,7 +55,7 @@ def test_map_without_images_is_seen_along_its_own_axes(wall_map: SceneMap) -> No
 
 def test_one_far_point_does_not_shrink_the_picture(wall_map: SceneMap) -> None:
     far = np.concatenate([wall_map.points, [[1e6, 1e6, 0.0]]])
-    axes = trajectory_figure([], with_points(wall_map, far)).axes[0]
+    axes = trajectory_figure([], with_points(wall_map, far), View.from_above(wall_map)).axes[0]
     assert max(map(abs, axes.get_xlim())) < 10.0
 
 
@@ -72,4 +72,6 @@ def test_camera_that_knows_no_direction_up_is_no_failure(wall_map: SceneMap) -> 
 @pytest.mark.parametrize('count', [0, 1, 200_000])
 def test_any_number_of_points_makes_a_picture(wall_map: SceneMap, count: int) -> None:
     points = np.random.default_rng(0).normal(size=(count, 3))
-    assert png(trajectory_figure([], with_points(wall_map, points))).startswith(b'\x89PNG')
+    assert png(
+        trajectory_figure([], with_points(wall_map, points), View.from_above(wall_map))
+    ).startswith(b'\x89PNG')

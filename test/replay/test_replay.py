@@ -29,7 +29,12 @@ from gam_relocalizer.geometry import pose_error, rigid3d_from_rotation
 from gam_relocalizer.localization.continuity import ContinuityOptions
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.replay.messages import POSE_TYPES
-from gam_relocalizer.replay.replay import ReplayOptions, replay_bag
+from gam_relocalizer.replay.replay import (
+    REFUSED_SHOWN,
+    WORST_SHOWN,
+    ReplayOptions,
+    replay_bag,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -393,14 +398,40 @@ def test_missing_truth_lists_topics(mcap_drive: Path, localizer: KnowingLocalize
         replay_bag(mcap_drive, localizer, ReplayOptions(truth_topic='/truth'))
 
 
-def test_best_and_worst_accepted_images_are_kept(
+def shown_in(replay: Replay) -> list[int]:
+    """Which images are kept, by their index."""
+    for timed in replay.illustrations:
+        assert stamp_of(int(timed.illustration.image[0, 0])) == timed.stamp_ns
+    return [int(timed.illustration.image[0, 0]) for timed in replay.illustrations]
+
+
+def test_best_image_and_those_with_fewest_inliers_are_kept(
     mcap_drive: Path, localizer: KnowingLocalizer
 ) -> None:
     replay = replay_bag(mcap_drive, localizer, ReplayOptions(period=1.0))
-    inliers = [attempt.result.inliers for attempt in replay.attempts]
-    best, worst = replay.illustrations
-    assert (best.estimate.inliers, worst.estimate.inliers) == (max(inliers), min(inliers))
-    assert stamp_of(int(best.image[0, 0])) == best.stamp_ns
+    by_inliers = sorted(range(0, 100, 10), key=lambda index: index % 7)
+    best, *worst = shown_in(replay)
+    assert best % 7 == by_inliers[-1] % 7
+    assert [index % 7 for index in worst] == [index % 7 for index in by_inliers[:WORST_SHOWN]]
+
+
+def test_images_with_the_largest_errors_are_kept_where_the_truth_is_known(
+    mcap_drive: Path, localizer: KnowingLocalizer
+) -> None:
+    localizer.mistaken = {30: 25, 50: 58, 70: 69}
+    options = ReplayOptions(period=1.0, truth_topic='/ground_truth')
+    _, *worst = shown_in(replay_bag(mcap_drive, localizer, options))
+    assert worst[:3] == [50, 30, 70]
+
+
+def test_refused_images_are_kept_with_their_rejected_pose_but_not_all(
+    mcap_drive: Path, localizer: KnowingLocalizer
+) -> None:
+    localizer.doubt = [0, 10, 20, 30, 40, 50]
+    replay = replay_bag(mcap_drive, localizer, ReplayOptions(period=1.0))
+    by_inliers = sorted(localizer.doubt, key=lambda index: -(index % 7))
+    assert shown_in(replay)[-REFUSED_SHOWN:] == by_inliers[:REFUSED_SHOWN]
+    assert len(replay.illustrations) <= 1 + WORST_SHOWN + REFUSED_SHOWN
 
 
 def test_progress_is_told_of_every_attempt(mcap_drive: Path, localizer: KnowingLocalizer) -> None:

@@ -63,7 +63,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope='module')
 def report(mcap_drive: Path, wall_map: SceneMap) -> Report:
-    localizer = KnowingLocalizer(wall_map.points, refuse=[20])
+    localizer = KnowingLocalizer(wall_map.points, refuse=[20], doubt=[40])
     options = ReplayOptions(period=1.0, truth_topic='/ground_truth')
     replay = replay_bag(mcap_drive, localizer, options)
     return Report(
@@ -82,11 +82,18 @@ def page(report: Report) -> Page:
 
 def test_page_is_balanced_and_holds_its_pictures(page: Page, report: Report) -> None:
     assert page.open == []
-    trajectory, errors, inliers, timings = range(4)
-    assert len(page.images) == len([trajectory, errors, inliers, timings]) + 2
+    above, side, errors, inliers, verdicts, timings = range(6)
+    pictures = [above, side, errors, inliers, verdicts, timings, *report.illustrations]
+    assert len(page.images) == len(pictures)
     for image in page.images:
         assert image.std() > 5.0
     assert page.tags.count('tr') > len(report.rows)
+
+
+def test_refused_image_is_shown_with_its_reason(page: Page, report: Report) -> None:
+    assert [timed.stamp_ns for timed in report.illustrations][-1] == stamp_of(40)
+    captions = [value for name, value in page.attributes if name == 'alt']
+    assert captions[-1] == '4.0 s, AMBIGUOUS, two places look & match alike'
 
 
 def test_page_loads_nothing_and_runs_nothing(page: Page) -> None:
@@ -99,7 +106,7 @@ def test_page_loads_nothing_and_runs_nothing(page: Page) -> None:
 
 def test_text_from_outside_is_escaped(page: Page) -> None:
     text = ''.join(page.text)
-    for part in ('Replay of <drive>', 'drive & more', 'needs 20 <inliers>'):
+    for part in ('Replay of <drive>', 'drive & more', 'needs 20 <inliers>', 'look & match'):
         assert part in text
 
 
@@ -108,7 +115,7 @@ def test_page_tells_every_attempt(page: Page, report: Report) -> None:
     for row in report.rows:
         assert f'{row.stamp_ns / 1e9:.3f}' in text
     assert Status.TOO_FEW_INLIERS.name in text
-    assert '9 / 10 (90%)' in text
+    assert '8 / 10 (80%)' in text
 
 
 def test_same_rows_give_the_same_picture(report: Report) -> None:

@@ -41,6 +41,14 @@ def rows() -> list[Row]:
     ]
 
 
+def row_with_truth() -> Row:
+    """15 cm off along x, and 3 degrees about z."""
+    half = np.radians(1.5)
+    pose, truth = rigid3d_from([1, 0, 0, 0], [1.15, 2, 3]), rigid3d_from([1, 0, 0, 0], [1, 2, 3])
+    turned = rigid3d_from([np.cos(half), 0, 0, np.sin(half)], pose.translation)
+    return Row(START_NS, Status.ACCEPTED, 'fine', 9, RobotPose(turned, np.eye(6)), truth)
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     write_trajectory(tmp_path, rows())
@@ -76,6 +84,17 @@ def test_places_without_a_fix_are_guessed_between_those_with(folder: Path) -> No
 
     np.testing.assert_allclose(drive.guessed_position(START_NS + 2 * 10**9), [2.0, 2.0, -1.0])
     np.testing.assert_allclose(drive.guessed_position(START_NS - 10**9), [0.0, 2.0, 0.0])
+
+
+def test_errors_come_back_where_the_truth_is_known(folder: Path) -> None:
+    assert [one.error for one in read_drive(folder).attempts] == 5 * [None]
+
+    write_attempts(folder, [row_with_truth()])
+    (attempt,) = read_drive(folder).attempts
+
+    assert attempt.error is not None
+    assert attempt.error.position == pytest.approx(0.15, abs=1e-6)
+    assert attempt.error.rotation_deg == pytest.approx(3.0, abs=1e-5)
 
 
 @pytest.mark.parametrize('name', [ATTEMPTS, POSES, SUMMARY])

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pycolmap
 import pytest
 
 from gam_relocalizer.errors import UsageError
+from gam_relocalizer.geometry import PoseError
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.scene_map import (
     ExtractorIdentity,
@@ -220,6 +222,20 @@ def test_refused_attempts_lie_between_the_fixes_around_them(
         'NO_POSE',
     ]
     assert inliers == [90, 30, 80, 0]
+
+
+def test_errors_are_shown_over_time_where_they_are_known(
+    scene_map: SceneMap, tmp_path: Path
+) -> None:
+    first, *others = drive_of(scene_map).attempts
+    known = replace(first, error=PoseError(0.25, 1.5))
+
+    write_recording(tmp_path / 'map.rrd', scene_map, Drive('abc', (known, *others)))
+
+    file = tmp_path / 'map.rrd'
+    for name, value in (('position', 0.25), ('rotation_deg', 1.5)):
+        (error,) = columns_of(file, f'/drive/error/{name}', 'Scalars:scalars')
+        assert error == [value]
 
 
 def test_a_drive_without_any_fix_has_verdicts_alone(scene_map: SceneMap, tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def matching(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help='Folder for matching.md, matching.json and neighbours.png.'),
+        typer.Option(help='Folder for matching.html, matching.md, matching.json and figures.'),
     ] = None,
 ) -> None:
     """Compare matchers: every image of a map against the map without it.

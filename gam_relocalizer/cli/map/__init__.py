@@ -6,13 +6,12 @@ from __future__ import annotations
 
 import typer
 
-from gam_relocalizer.cli.map import align, build, change, importing, inspect, view
+from gam_relocalizer.cli.map import align, build, change, importing, inspect
 
 app = typer.Typer(help='Build, inspect, align and change maps.', no_args_is_help=True)
 app.command()(build.build)
 app.command()(inspect.info)
 app.command()(inspect.check)
-app.command()(view.view)
 app.command()(align.align)
 app.command('import')(importing.import_map)
 app.command()(change.extend)

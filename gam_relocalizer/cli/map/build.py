@@ -62,7 +62,9 @@ def build(  # noqa: PLR0913 - one argument per option
             'lies in the frame and scale of these poses.'
         ),
     ] = None,
-    extractor: Annotated[str, typer.Option(help='Local features: xfeat or sift.')] = 'xfeat',
+    extractor: Annotated[
+        str, typer.Option(help='Local features, such as xfeat or sift.')
+    ] = 'xfeat',
     mapper: Annotated[Mapper, typer.Option(help='Used without poses.')] = Mapper.INCREMENTAL,
     max_keypoints: Annotated[int, typer.Option(min=1, help='Features per image.')] = 2048,
     global_descriptor: Annotated[

@@ -71,7 +71,7 @@ def import_map(  # noqa: PLR0913 - one argument per option
     ] = '',
     extractor: Annotated[
         str | None,
-        typer.Option(help='Local features: xfeat or sift; with --features, what they are.'),
+        typer.Option(help='Local features, such as xfeat or sift; with --features, what they are.'),
     ] = None,
     max_keypoints: Annotated[
         int, typer.Option(min=1, help='Features per image, where images are read.')
@@ -228,7 +228,7 @@ def _foreign_features(
             raise UsageError(msg)
         return DatabaseFeatures(database)
     if extractor is None or features is None:
-        msg = '--features needs --extractor, the name of what found them: xfeat or sift'
+        msg = '--features needs --extractor, the name of what found them, such as sift'
         raise UsageError(msg)
     return HlocFeatures(features, extractor)
 

@@ -118,7 +118,8 @@ def _with_coverage(
 
 def _write_check(report: CheckReport, path: Path, out: Path) -> None:
     from gam_relocalizer.geometry import write_text
-    from gam_relocalizer.mapping.pictures import coverage_figure, write_picture
+    from gam_relocalizer.mapping.pictures import coverage_figure
+    from gam_relocalizer.plots import write_picture
     from gam_relocalizer.scene_map import load_map
 
     out.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 # Copyright 2026 gam_relocalizer authors
 # SPDX-License-Identifier: Apache-2.0
-"""`map view`."""
+"""`view`."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def view(
         write_recording(save, scene_map, drive)
         typer.echo(f'recording: {save}')
         return
-    with tempfile.TemporaryDirectory(prefix='map_view_') as folder:
+    with tempfile.TemporaryDirectory(prefix='view_') as folder:
         file = Path(folder, f'{path.resolve().name}.rrd')
         write_recording(file, scene_map, drive)
         show(file)
