@@ -28,7 +28,7 @@ from gam_relocalizer.demo import recording, trajectories
 from gam_relocalizer.demo.renderer import Renderer
 from gam_relocalizer.demo.shipped import demo_map_path
 from gam_relocalizer.demo.world import demo_world
-from gam_relocalizer.evaluation.localization import world_from_map_of
+from gam_relocalizer.evaluation.query_set import world_from_map_of
 from gam_relocalizer.geometry import pose_error, read_poses, write_poses
 from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.images import list_images, read_image

@@ -35,8 +35,8 @@ from process_usage import resources
 
 from gam_relocalizer.demo.shipped import demo_map_path
 from gam_relocalizer.demo.trajectories import BASE_FROM_CAMERA
-from gam_relocalizer.evaluation.localization import read_query_set
 from gam_relocalizer.evaluation.metrics import THRESHOLDS, Threshold, accuracy
+from gam_relocalizer.evaluation.query_set import read_query_set
 from gam_relocalizer.features.local import LocalFeatures
 from gam_relocalizer.features.registry import create_extractor
 from gam_relocalizer.features.vlad import RETRIEVAL_NAME, Vlad
@@ -302,7 +302,7 @@ def _answers_to_set(localizers: _Localizers, folder: Path) -> dict[int, _Answers
     answers = {bits: _Answers() for bits in DESCRIPTOR_BITS}
     for name, truth in query_set.truth.items():
         image = read_image(folder / 'query' / name)
-        for bits, result in localizers.attempts(image, query_set.camera):
+        for bits, result in localizers.attempts(image, query_set.cameras[name]):
             answers[bits].take(result, query_set.world_from_map, truth)
     return answers
 

@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gam_relocalizer.cameras import parse_camera
-from gam_relocalizer.evaluation.localization import world_from_map_of
 from gam_relocalizer.evaluation.metrics import accuracy
+from gam_relocalizer.evaluation.query_set import world_from_map_of
 from gam_relocalizer.geometry import PoseError, pose_error, read_poses
 from gam_relocalizer.image_set import ImageSet
 from gam_relocalizer.images import list_images, read_image
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 SETS = ('redkitchen', 'castle-p30', 'fountain-p11', 'fox')
 # The calibration that comes with these is nominal; structure from motion refines it.
 NOMINAL_CAMERAS = frozenset({'redkitchen'})
-STAGES = ('extraction', 'retrieval', 'matching', 'pose', 'total')
+STAGES = ('extraction', 'retrieval', 'matching', 'pose', 'verdict', 'total')
 
 
 @dataclass(frozen=True)

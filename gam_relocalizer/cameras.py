@@ -69,7 +69,19 @@ def parse_camera(description: str | Path) -> pycolmap.Camera:
     Raises:
         CameraError: The file is missing or the line is not a camera of one of `CAMERA_MODELS`.
     """
-    text, source = _description_text(description)
+    return camera_from_line(*_description_text(description))
+
+
+def camera_from_line(text: str, source: str) -> pycolmap.Camera:
+    """Reads `MODEL WIDTH HEIGHT PARAMS...`.
+
+    Args:
+        text: The line; what follows a `#` is a comment.
+        source: Where it comes from, for errors.
+
+    Raises:
+        CameraError: The line is not a camera of one of `CAMERA_MODELS`.
+    """
     words = text.split('#', maxsplit=1)[0].split()
     if len(words) < 4:
         msg = (

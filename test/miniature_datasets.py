@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -40,9 +41,12 @@ def _pixels(index: int) -> NDArray[np.uint8]:
     return cv2.cvtColor(CornerRoom().render(pose(index)), cv2.COLOR_RGB2BGR)
 
 
-def write_frame(path: Path, index: int) -> None:
+def write_frame(path: Path, index: int, scale: float = 1.0) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), _pixels(index))
+    pixels = _pixels(index)
+    if scale != 1.0:
+        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(path), pixels)
 
 
 def write_cambridge(folder: Path, radial: float = 0.0) -> dict[str, pycolmap.Rigid3d]:
@@ -155,6 +159,61 @@ def write_kitti(folder: Path) -> dict[str, pycolmap.Rigid3d]:
     (folder / 'poses').mkdir()
     (folder / 'poses' / '07.txt').write_text(''.join(lines))
     return poses
+
+
+@dataclass(frozen=True)
+class ListedQueries:
+    """Images with a list of queries, whose poses only the benchmark knows.
+
+    Attributes:
+        folder: What names are relative to.
+        file: The list.
+        poses: camera_from_world by name.
+    """
+
+    folder: Path
+    file: Path
+    poses: dict[str, pycolmap.Rigid3d]
+
+
+def write_aachen(folder: Path) -> ListedQueries:
+    """Three images by day and one by night, of a camera with fewer pixels."""
+    lines, poses = ['# queries with intrinsics\n'], {}
+    for index in (1, 3, 5, 6):
+        by_day = index < 6
+        name = f'query/{"day/milestone" if by_day else "night/nexus5x"}/IMG_{index}.png'
+        scale = 1.0 if by_day else 0.75
+        write_frame(folder / name, index, scale)
+        width, height = int(CAMERA.width * scale), int(CAMERA.height * scale)
+        lines.append(
+            f'{name} SIMPLE_RADIAL {width} {height} {FOCAL * scale} {width / 2} {height / 2} 0.0\n'
+        )
+        poses[name] = pose(index)
+    (folder / 'queries.txt').write_text(''.join(lines))
+    return ListedQueries(folder, folder / 'queries.txt', poses)
+
+
+def write_robotcar(folder: Path) -> ListedQueries:
+    """Two cameras of a car, whose images have the same names: their stamps."""
+    lines, poses = [], {}
+    for index in (2, 5):
+        camera = 'rear' if index == 2 else 'left'
+        name = f'night-rain/{camera}/1417176976842290.png'
+        write_frame(folder / 'images' / name, index)
+        lines.append(f'{name} PINHOLE {CAMERA.width} {CAMERA.height} {FOCAL} {FOCAL} 192 144')
+        poses[name] = pose(index)
+    # hloc leaves out the end of the last line
+    (folder / 'queries.txt').write_text('\n'.join(lines))
+    return ListedQueries(folder / 'images', folder / 'queries.txt', poses)
+
+
+def write_hloc_results(file: Path, poses: Mapping[str, pycolmap.Rigid3d]) -> None:
+    """A results.txt of hloc: base names, and all digits."""
+    lines = [
+        f'{name.split("/")[-1]} {_numbers(quaternion_wxyz(one))} {_numbers(one.translation)}\n'
+        for name, one in poses.items()
+    ]
+    file.write_text(''.join(lines))
 
 
 def same_poses(

@@ -12,31 +12,31 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
-from gam_relocalizer.cameras import parse_camera, undistort
-from gam_relocalizer.errors import CameraError, MapError, UsageError
+from gam_relocalizer.cameras import undistort
 from gam_relocalizer.evaluation.calibration import calibrate, precision_recall
 from gam_relocalizer.evaluation.metrics import CORRECT, accuracy
-from gam_relocalizer.geometry import PoseError, pose_error, read_poses
-from gam_relocalizer.images import list_images, read_image
+from gam_relocalizer.evaluation.query_set import read_query
+from gam_relocalizer.geometry import pose_error
 from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
+from gam_relocalizer.localization.pictures import Foremost, Illustration
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.localization.retrieval import retrieve
 from gam_relocalizer.localization.scenes import Coarse
 from gam_relocalizer.mapping.progress import ignore_progress
-from gam_relocalizer.scene_map import load_map
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-    from pathlib import Path
 
+    import pycolmap
     from numpy.typing import NDArray
 
     from gam_relocalizer.evaluation.calibration import Calibration, PrecisionRecall
     from gam_relocalizer.evaluation.metrics import Accuracy
+    from gam_relocalizer.evaluation.query_set import QuerySet
     from gam_relocalizer.features.global_descriptor import GlobalDescriptor
     from gam_relocalizer.features.local import LocalExtractor
+    from gam_relocalizer.geometry import PoseError
     from gam_relocalizer.localization.result import LocalizationResult
     from gam_relocalizer.mapping.progress import Progress
     from gam_relocalizer.matching.matcher import Matcher
@@ -52,31 +52,11 @@ COVISIBLE_POINTS = 30
 COVISIBLE_SHARE = 0.2
 COVISIBLE_ANGLE_DEG = 30.0
 
+# So many poses are kept to be drawn.
+WORST_SHOWN = 4
+
 # A point that the camera model folds back into the image has another ray than its pixel.
 _SAME_RAY = 1e-2
-
-
-@dataclass(frozen=True)
-class QuerySet:
-    """Images to localize in a map, with the truth.
-
-    Attributes:
-        scene_map: The map.
-        folder: Where the images are.
-        camera: Of all images.
-        truth: By name of image, camera_from_world.
-        images_without_truth: Number of further images in the folder; they are no queries.
-        world_from_map: Identity where the truth is in the frame of the map.
-        aligned: Whether `world_from_map` was fitted to true poses of the map's images.
-    """
-
-    scene_map: SceneMap
-    folder: Path
-    camera: pycolmap.Camera
-    truth: Mapping[str, pycolmap.Rigid3d]
-    images_without_truth: int
-    world_from_map: pycolmap.Sim3d
-    aligned: bool
 
 
 @dataclass(frozen=True)
@@ -102,15 +82,18 @@ class Outcome:
 
     Attributes:
         status: The verdict.
-        error: Of the best pose found, accepted or not [unit of the truth]; None without a pose.
+        error: Of the best pose found, accepted or not [unit of the truth]; None without a pose or
+            without a truth.
         confidence: In that pose.
         milliseconds: For matching and pose, over all scenes tried.
+        camera_from_world: The best pose found, in the world of the truth; None without one.
     """
 
     status: Status
     error: PoseError | None
     confidence: float
     milliseconds: float
+    camera_from_world: pycolmap.Rigid3d | None
 
 
 @dataclass(frozen=True)
@@ -133,6 +116,23 @@ class MethodScore:
 
 
 @dataclass(frozen=True)
+class Tally:
+    """What a method found, whether or not anybody knows the truth.
+
+    Attributes:
+        queries: All of them.
+        found: Those with a pose, whatever the verdict.
+        accepted: Those with an accepted pose.
+        milliseconds: Median over the queries, for matching and pose.
+    """
+
+    queries: int
+    found: int
+    accepted: int
+    milliseconds: float
+
+
+@dataclass(frozen=True)
 class RetrievalScore:
     """How well retrieval finds reference images that see what the query sees.
 
@@ -148,6 +148,22 @@ class RetrievalScore:
 
 
 @dataclass(frozen=True)
+class Sights:
+    """What pictures of an evaluation show beyond its numbers.
+
+    Attributes:
+        scene_map: The map.
+        positions: [3] true positions of the cameras in the frame of the map, by name of image.
+        worst: By name of image, the few poses of the last method with the largest errors, or
+            without truth the fewest inliers.
+    """
+
+    scene_map: SceneMap
+    positions: Mapping[str, NDArray[np.float64]]
+    worst: Mapping[str, Illustration]
+
+
+@dataclass(frozen=True)
 class SetEvaluation:
     """All methods on one set of queries.
 
@@ -159,8 +175,11 @@ class SetEvaluation:
         aligned: See `QuerySet`.
         queries: Number of queries.
         images_without_truth: Number of images left out.
-        retrieval: Of the reference images.
+        retrieval: Of the reference images; None when no truth is known.
         outcomes: By method and name of image.
+        others: Errors of the poses that other localizers found, by name of the localizer and of
+            the image; an image without such a pose is not there.
+        sights: For pictures; None when there are to be none.
     """
 
     name: str
@@ -170,8 +189,15 @@ class SetEvaluation:
     aligned: bool
     queries: int
     images_without_truth: int
-    retrieval: RetrievalScore
+    retrieval: RetrievalScore | None
     outcomes: Mapping[Method, Mapping[str, Outcome]]
+    others: Mapping[str, Mapping[str, PoseError]]
+    sights: Sights | None = None
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the true poses of the queries are known."""
+        return self.retrieval is not None
 
 
 def methods_of(matchers: Sequence[str]) -> tuple[Method, ...]:
@@ -185,102 +211,6 @@ def methods_of(matchers: Sequence[str]) -> tuple[Method, ...]:
     )
 
 
-def read_query_set(
-    map_path: Path,
-    folder: Path,
-    truth: Path,
-    camera: str | None = None,
-    reference: Path | None = None,
-) -> QuerySet:
-    """Reads all but the images.
-
-    Args:
-        map_path: The map bundle.
-        folder: The images; those that the truth names are queries.
-        truth: Poses file, camera_from_world.
-        camera: See `parse_camera`; the map's own if none is given.
-        reference: Poses file of the images that the map was built from, in the world of the truth.
-
-    Raises:
-        UsageError: No such folder, no query in it, or a reference that lacks an image of the map.
-        PosesFileError: A poses file is missing or malformed.
-        CameraError: The camera cannot be understood, or the map has not exactly one of its own.
-        MapError: The map is damaged, or does not fit over the reference.
-    """
-    names = list_images(folder)
-    poses = read_poses(truth)
-    true_mapping = None if reference is None else read_poses(reference)
-    parsed_camera = None if camera is None else parse_camera(camera)
-    queries = {name: poses[name] for name in names if name in poses}
-    if not queries:
-        msg = (
-            f'{truth}: names none of the {len(names)} images in {folder}; expected names like '
-            f'`{names[0]}`, found names like `{next(iter(poses))}`'
-        )
-        raise UsageError(msg)
-    scene_map = load_map(map_path)
-    return QuerySet(
-        scene_map=scene_map,
-        folder=folder,
-        camera=parsed_camera or own_camera(scene_map),
-        truth=queries,
-        images_without_truth=len(names) - len(queries),
-        world_from_map=(
-            pycolmap.Sim3d() if true_mapping is None else world_from_map_of(scene_map, true_mapping)
-        ),
-        aligned=true_mapping is not None and not scene_map.manifest.frame.metric,
-    )
-
-
-def own_camera(scene_map: SceneMap) -> pycolmap.Camera:
-    """The camera that took all images of a map, as its build left it.
-
-    Raises:
-        CameraError: There are several, or the manifest does not tell.
-    """
-    report = scene_map.manifest.build.get('report')
-    lines = report.get('cameras') if isinstance(report, dict) else None
-    if not isinstance(lines, list) or len(lines) != 1 or not isinstance(lines[0], str):
-        found = f'{len(lines)} cameras' if isinstance(lines, list) else 'no cameras'
-        msg = (
-            f'{scene_map.path}: its manifest tells of {found}, expected one that took the queries '
-            f'too; give the camera of the queries with --camera'
-        )
-        raise CameraError(msg)
-    return parse_camera(lines[0])
-
-
-def world_from_map_of(
-    scene_map: SceneMap, true_mapping: Mapping[str, pycolmap.Rigid3d]
-) -> pycolmap.Sim3d:
-    """The similarity that lays the map's cameras over the true ones; identity for a metric map.
-
-    Args:
-        scene_map: A map.
-        true_mapping: camera_from_world of its images, by name.
-
-    Raises:
-        UsageError: An image of the map has no true pose.
-        MapError: No similarity fits.
-    """
-    if scene_map.manifest.frame.metric:
-        return pycolmap.Sim3d()
-    missing = [name for name in scene_map.image_names if name not in true_mapping]
-    if missing:
-        msg = (
-            f'{scene_map.path}: {len(missing)} of its {scene_map.num_images} images have no true '
-            f'pose in the reference, the first is `{missing[0]}`'
-        )
-        raise UsageError(msg)
-    in_map = [pose.tgt_origin_in_src() for pose in scene_map.camera_from_map]
-    in_world = [true_mapping[name].tgt_origin_in_src() for name in scene_map.image_names]
-    fitted = pycolmap.estimate_sim3d(np.array(in_map), np.array(in_world))
-    if fitted is None:
-        msg = f'{scene_map.path}: no similarity lays its cameras over the true ones'
-        raise MapError(msg)
-    return fitted
-
-
 def evaluate_set(
     query_set: QuerySet,
     extractor: LocalExtractor,
@@ -288,6 +218,7 @@ def evaluate_set(
     matchers: Mapping[str, Matcher],
     retrieved_images: int,
     progress: Progress = ignore_progress,
+    others: Mapping[str, Mapping[str, pycolmap.Rigid3d]] | None = None,
 ) -> SetEvaluation:
     """Localizes every query by every method; it is described once.
 
@@ -298,6 +229,8 @@ def evaluate_set(
         matchers: By name; see `methods_of` for what their order means.
         retrieved_images: R of the paper.
         progress: Told of the step localize.
+        others: camera_from_world of queries, by name of the localizer that found them and of the
+            image; scored against the truth.
 
     Raises:
         MapError: The map was made with another local or global descriptor.
@@ -319,30 +252,46 @@ def evaluate_set(
         )
         for method in methods_of(tuple(matchers))
     }
-    map_from_world = query_set.world_from_map.inverse()
+    truth, map_from_world = query_set.truth, query_set.world_from_map.inverse()
     outcomes: dict[Method, dict[str, Outcome]] = {method: {} for method in localizers}
+    *_, whole = localizers
     found, covisible = [], []
-    for done, (name, truth) in enumerate(query_set.truth.items(), start=1):
-        image = _read_query(query_set, name)
+    positions: dict[str, NDArray[np.float64]] = {}
+    worst = Foremost[tuple[str, Illustration]](WORST_SHOWN)
+    for done, name in enumerate(query_set.names, start=1):
+        image, camera = read_query(query_set, name), query_set.cameras[name]
         features = extractor.extract(image)
         described = describer.describe(image, features)
         for method, localizer in localizers.items():
-            result = localizer.localize_features(features, described, query_set.camera)
-            outcomes[method][name] = _outcome(result, truth, query_set.world_from_map)
-        found.append(retrieve(described, scene_map, RANKS[-1]).images)
-        camera_from_map = map_from_world.transform_camera_world(truth)
-        covisible.append(covisible_images(scene_map, camera_from_map, query_set.camera))
-        progress('localize', done, len(query_set.truth))
+            result = localizer.localize_features(features, described, camera)
+            outcome = _outcome(result, truth.get(name), query_set.world_from_map)
+            outcomes[method][name] = outcome
+            if method == whole and result.estimate is not None:
+                illustration = Illustration(image, camera, result.estimate)
+                worst.consider((name, illustration), _badness(outcome, result))
+        if name in truth:
+            found.append(retrieve(described, scene_map, RANKS[-1]).images)
+            camera_from_map = map_from_world.transform_camera_world(truth[name])
+            covisible.append(covisible_images(scene_map, camera_from_map, camera))
+            positions[name] = camera_from_map.tgt_origin_in_src()
+        progress('localize', done, len(query_set.names))
     return SetEvaluation(
         name=scene_map.path.resolve().name,
         map_id=scene_map.manifest.map_id,
         metric=scene_map.manifest.frame.metric,
         global_descriptor=scene_map.manifest.retrieval,
         aligned=query_set.aligned,
-        queries=len(query_set.truth),
+        queries=len(query_set.names),
         images_without_truth=query_set.images_without_truth,
-        retrieval=score_retrieval(found, covisible),
+        retrieval=score_retrieval(found, covisible) if truth else None,
         outcomes=outcomes,
+        others={
+            localizer: {
+                name: pose_error(pose, truth[name]) for name, pose in poses.items() if name in truth
+            }
+            for localizer, poses in (others or {}).items()
+        },
+        sights=Sights(scene_map, positions, dict(worst.items)),
     )
 
 
@@ -418,6 +367,17 @@ def summarise(outcomes: Iterable[Outcome]) -> MethodScore:
     )
 
 
+def tally(outcomes: Iterable[Outcome]) -> Tally:
+    """Counts what a method found in at least one query."""
+    every = list(outcomes)
+    return Tally(
+        queries=len(every),
+        found=sum(one.camera_from_world is not None for one in every),
+        accepted=sum(one.status is Status.ACCEPTED for one in every),
+        milliseconds=float(np.median([one.milliseconds for one in every])),
+    )
+
+
 def calibration_of(outcomes: Iterable[Outcome]) -> tuple[Calibration, PrecisionRecall]:
     """Reliability, and precision and recall, of the confidence in the poses that were found."""
     every = list(outcomes)
@@ -428,26 +388,18 @@ def calibration_of(outcomes: Iterable[Outcome]) -> tuple[Calibration, PrecisionR
 
 
 def _outcome(
-    result: LocalizationResult, truth: pycolmap.Rigid3d, world_from_map: pycolmap.Sim3d
+    result: LocalizationResult, truth: pycolmap.Rigid3d | None, world_from_map: pycolmap.Sim3d
 ) -> Outcome:
-    error = None
+    pose = error = None
     if result.estimate is not None:
         pose = world_from_map.transform_camera_world(result.estimate.camera_from_map)
-        error = pose_error(pose, truth)
+        error = None if truth is None else pose_error(pose, truth)
     milliseconds = result.timings.matching + result.timings.pose
-    return Outcome(result.status, error, result.confidence, milliseconds)
+    return Outcome(result.status, error, result.confidence, milliseconds, pose)
 
 
-def _read_query(query_set: QuerySet, name: str) -> NDArray[np.uint8]:
-    image, camera = read_image(query_set.folder / name), query_set.camera
-    height, width = image.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        msg = (
-            f'{query_set.folder / name}: the image has {width} x {height} pixels, the camera '
-            f'{camera.width} x {camera.height}; give the camera of the queries with --camera'
-        )
-        raise CameraError(msg)
-    return image
+def _badness(outcome: Outcome, result: LocalizationResult) -> float:
+    return -result.inliers if outcome.error is None else outcome.error.position
 
 
 def _in_view(in_camera: NDArray[np.float64], camera: pycolmap.Camera) -> NDArray[np.bool_]:

@@ -11,14 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gam_relocalizer.evaluation.calibration import (
-    precision_recall_figure,
-    reliability_figure,
-    write_figure,
-)
-from gam_relocalizer.evaluation.localization import RANKS, calibration_of, summarise
-from gam_relocalizer.evaluation.metrics import CORRECT, THRESHOLDS
-from gam_relocalizer.geometry import write_text
+from gam_relocalizer.evaluation.calibration import precision_recall_figure, reliability_figure
+from gam_relocalizer.evaluation.localization import RANKS, calibration_of, summarise, tally
+from gam_relocalizer.evaluation.localization_page import NamedFigure, figures_of, page
+from gam_relocalizer.evaluation.metrics import CORRECT, THRESHOLDS, accuracy
+from gam_relocalizer.geometry import quaternion_wxyz, write_text
+from gam_relocalizer.plots import write_picture
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -32,15 +30,19 @@ if TYPE_CHECKING:
         SetEvaluation,
     )
     from gam_relocalizer.evaluation.metrics import Accuracy, Threshold
+    from gam_relocalizer.geometry import PoseError
 
 DEFAULT_MATCHERS = ('nn-ratio', 'nn-cross', 'nn-distance', 'nn-lgcnet', 'nn-oanet', 'gam')
 
 MARKDOWN = 'localization.md'
 JSON = 'localization.json'
+PAGE = 'localization.html'
 RELIABILITY = 'reliability.png'
 PRECISION_RECALL = 'precision_recall.png'
 
 _LEFT = '---'
+# Of a set: what has rows of its own in the JSON.
+_PARTS = frozenset({'retrieval', 'outcomes', 'others', 'sights'})
 _KIND = 'gam_relocalizer evaluate localization'
 
 
@@ -61,6 +63,16 @@ class LocalizationReport:
         """The rows of the tables."""
         return tuple(self.evaluations[0].outcomes)
 
+    @property
+    def scored(self) -> list[SetEvaluation]:
+        """The sets with a truth."""
+        return [one for one in self.evaluations if one.has_truth]
+
+    @property
+    def counted(self) -> list[SetEvaluation]:
+        """The sets without one."""
+        return [one for one in self.evaluations if not one.has_truth]
+
 
 @dataclass(frozen=True)
 class _Column:
@@ -78,55 +90,66 @@ class _Column:
 
 
 def markdown(report: LocalizationReport) -> str:
-    """The paper's Table II by all poses and by the accepted ones, retrieval and confidence."""
-    parts = [
-        '## All poses found, whatever the verdict (as in the paper)',
-        *_tables(report, _found, _found_columns),
-        '## Accepted poses only, a rejected one counts as a miss',
-        *_tables(report, _accepted, _accepted_columns),
-        '## Retrieval of a covisible image',
-        _retrieval_table(report.evaluations),
-        f'## Confidence of {_label(report.methods[-1])}',
-        *_confidence_parts(*_calibration(report)),
-    ]
+    """The paper's Table II by all poses and by the accepted ones, retrieval and confidence.
+
+    Of sets without truth, only how many poses were found and accepted.
+    """
+    parts = []
+    if report.scored:
+        parts += [
+            '## All poses found, whatever the verdict (as in the paper)',
+            *_tables(report, _found, _found_columns, _accuracy_of_others),
+            '## Accepted poses only, a rejected one counts as a miss',
+            *_tables(report, _accepted, _accepted_columns, _no_others),
+            '## Retrieval of a covisible image',
+            _retrieval_table(report.scored),
+            f'## Confidence of {_label(report.methods[-1])}',
+            *_confidence_parts(*_calibration(report)),
+        ]
+    parts += _counted_parts(report)
     return '\n\n'.join(parts) + '\n'
 
 
 def as_json(report: LocalizationReport) -> dict[str, Any]:
     """All numbers, shares in [0, 1]; what is not defined, as a median of nothing, is None."""
-    calibration, curve = _calibration(report)
     content = {
         'kind': _KIND,
         'retrieved_images': report.retrieved_images,
         'sets': [_set_row(one) for one in report.evaluations],
-        'mean': [
-            {
-                **_method_row(method),
-                **{
-                    name: _recall_rows(_mean_recall(report, method, part))
-                    for name, part in (('found', _found), ('accepted', _accepted))
-                },
-            }
-            for method in report.methods
-        ],
-        'confidence': {
-            **_method_row(report.methods[-1]),
-            **asdict(calibration),
-            'recall_without_error': curve.recall_without_error,
-            'precision_recall': {name: value.tolist() for name, value in vars(curve).items()},
-        },
+        **(_summary_rows(report) if report.scored else {}),
     }
     finite: dict[str, Any] = _finite(content)
     return finite
 
 
 def write_report(folder: Path, report: LocalizationReport) -> None:
-    """Writes tables, numbers and the figures of the confidence to an existing folder."""
+    """Writes tables, numbers, figures and a page of them all to an existing folder."""
     write_text(folder / MARKDOWN, markdown(report))
     write_text(folder / JSON, json.dumps(as_json(report), indent=2, allow_nan=False) + '\n')
+    figures = [*figures_of(report.evaluations), *_confidence_figures(report)]
+    for one in figures:
+        write_picture(folder / one.file, one.figure)
+    write_text(folder / PAGE, page(report.evaluations, figures, markdown(report)))
+
+
+def _confidence_figures(report: LocalizationReport) -> list[NamedFigure]:
+    if not report.scored:
+        return []
     calibration, curve = _calibration(report)
-    write_figure(folder / RELIABILITY, reliability_figure(calibration))
-    write_figure(folder / PRECISION_RECALL, precision_recall_figure(curve))
+    whole = _label(report.methods[-1])
+    return [
+        NamedFigure(
+            RELIABILITY,
+            reliability_figure(calibration),
+            f'Share of correct poses over the confidence of {whole}: on the diagonal when '
+            f'calibrated. Below, for how many queries each point stands.',
+        ),
+        NamedFigure(
+            PRECISION_RECALL,
+            precision_recall_figure(curve),
+            'Precision over recall, when poses are accepted from a confidence on.',
+        ),
+    ]
 
 
 def _found(score: MethodScore) -> Accuracy:
@@ -137,37 +160,75 @@ def _accepted(score: MethodScore) -> Accuracy:
     return score.accepted
 
 
+def _accuracy_of_others(evaluation: SetEvaluation) -> dict[str, Accuracy]:
+    """Of the poses that other localizers found."""
+    return {
+        name: accuracy(list(errors.values()), evaluation.queries)
+        for name, errors in evaluation.others.items()
+    }
+
+
+def _no_others(_: SetEvaluation) -> dict[str, Accuracy]:
+    """Nobody's verdict on the poses of others is known."""
+    return {}
+
+
 def _tables(
     report: LocalizationReport,
     part: Callable[[MethodScore], Accuracy],
-    columns: Callable[[Sequence[MethodScore], str], list[_Column]],
+    columns: Callable[[Sequence[MethodScore], Sequence[Accuracy], str], list[_Column]],
+    others: Callable[[SetEvaluation], Mapping[str, Accuracy]],
 ) -> list[str]:
-    """The mean over the sets, then every set."""
+    """The mean over the sets with truth, then every one of them."""
     parts = []
-    if len(report.evaluations) > 1:
+    evaluations, rows = report.scored, _method_columns(report.methods, others(report.scored[0]))
+    if len(evaluations) > 1:
         means = [_mean_recall(report, method, part) for method in report.methods]
-        parts.append(f'Mean over {len(report.evaluations)} sets:')
-        parts.append(_table([*_method_columns(report.methods), *_recall_columns(means, '')]))
-    for evaluation in report.evaluations:
+        means += _mean_recalls_of_others([others(one) for one in evaluations]).values()
+        parts.append(f'Mean over {len(evaluations)} sets:')
+        parts.append(_table([*rows, *_recall_columns(means, '')]))
+    for evaluation in evaluations:
         scores = _scores(evaluation)
+        accuracies = [*(part(one) for one in scores), *others(evaluation).values()]
         unit = 'm' if evaluation.metric else 'units'
         parts.append(_caption(evaluation, report.retrieved_images))
         parts.append(
             _table(
                 [
-                    *_method_columns(report.methods),
-                    *_recall_columns([part(one).recall for one in scores], unit),
-                    *columns(scores, unit),
+                    *rows,
+                    *_recall_columns([one.recall for one in accuracies], unit),
+                    *columns(scores, accuracies, unit),
                 ]
             )
         )
     return parts
 
 
-def _method_columns(methods: Sequence[Method]) -> list[_Column]:
+def _counted_parts(report: LocalizationReport) -> list[str]:
+    """Tables of the sets without truth."""
+    parts = ['## Poses, where no truth is known'] if report.counted else []
+    for evaluation in report.counted:
+        tallies = [tally(outcomes.values()) for outcomes in evaluation.outcomes.values()]
+        times = _numbers([one.milliseconds for one in tallies], '.0f', None)
+        parts.append(_caption(evaluation, report.retrieved_images))
+        parts.append(
+            _table(
+                [
+                    *_method_columns(report.methods, {}),
+                    _Column('Poses', [f'{one.found}/{one.queries}' for one in tallies]),
+                    _Column('Accepted', [f'{one.accepted}/{one.queries}' for one in tallies]),
+                    _Column('Time [ms]', times),
+                ]
+            )
+        )
+    return parts
+
+
+def _method_columns(methods: Sequence[Method], others: Iterable[str]) -> list[_Column]:
+    names = list(others)
     return [
-        _Column('Coarse', [method.name for method in methods], _LEFT),
-        _Column('Matcher', [method.matcher for method in methods], _LEFT),
+        _Column('Coarse', [*(method.name for method in methods), *names], _LEFT),
+        _Column('Matcher', [*(method.matcher for method in methods), *('-' for _ in names)], _LEFT),
     ]
 
 
@@ -181,20 +242,27 @@ def _recall_columns(recalls: Sequence[Mapping[Threshold, float]], unit: str) -> 
     ]
 
 
-def _found_columns(scores: Sequence[MethodScore], unit: str) -> list[_Column]:
+def _found_columns(
+    scores: Sequence[MethodScore], accuracies: Sequence[Accuracy], unit: str
+) -> list[_Column]:
+    """Rows beyond the scores are those of others, who say nothing of their time."""
+    times = [score.milliseconds for score in scores]
+    times += [math.nan] * (len(accuracies) - len(scores))
     return [
-        *_median_columns([score.found for score in scores], unit),
-        _Column('Poses', [f'{one.found.localized}/{one.found.queries}' for one in scores]),
-        _Column('Time [ms]', _numbers([score.milliseconds for score in scores], '.0f', None)),
+        *_median_columns(accuracies, unit),
+        _Column('Poses', [f'{one.localized}/{one.queries}' for one in accuracies]),
+        _Column('Time [ms]', _numbers(times, '.0f', None)),
     ]
 
 
-def _accepted_columns(scores: Sequence[MethodScore], unit: str) -> list[_Column]:
+def _accepted_columns(
+    scores: Sequence[MethodScore], accuracies: Sequence[Accuracy], unit: str
+) -> list[_Column]:
     return [
-        *_median_columns([score.accepted for score in scores], unit),
+        *_median_columns(accuracies, unit),
         _Column(f'Worst [{unit}]', _numbers([one.worst_position for one in scores], '.3f', min)),
         _Column('Worst [deg]', _numbers([one.worst_rotation_deg for one in scores], '.2f', min)),
-        _Column('Accepted', [f'{one.accepted.localized}/{one.accepted.queries}' for one in scores]),
+        _Column('Accepted', [f'{one.localized}/{one.queries}' for one in accuracies]),
     ]
 
 
@@ -223,7 +291,7 @@ def _caption(evaluation: SetEvaluation, retrieved_images: int) -> str:
 
 
 def _retrieval_table(evaluations: Sequence[SetEvaluation]) -> str:
-    scores = [one.retrieval for one in evaluations]
+    scores = [one.retrieval for one in evaluations if one.retrieval is not None]
     return _table(
         [
             _Column('Map', [one.name for one in evaluations], _LEFT),
@@ -267,12 +335,10 @@ def _confidence_parts(calibration: Calibration, curve: PrecisionRecall) -> list[
 
 
 def _calibration(report: LocalizationReport) -> tuple[Calibration, PrecisionRecall]:
-    """Of the whole method, the last row, over the queries of all sets."""
+    """Of the whole method, the last row, over the queries of all sets with truth."""
     whole = report.methods[-1]
     return calibration_of(
-        outcome
-        for evaluation in report.evaluations
-        for outcome in evaluation.outcomes[whole].values()
+        outcome for evaluation in report.scored for outcome in evaluation.outcomes[whole].values()
     )
 
 
@@ -285,9 +351,19 @@ def _mean_recall(
 ) -> dict[Threshold, float]:
     """The mean over the sets, each counting the same."""
     recalls = [
-        part(summarise(evaluation.outcomes[method].values())).recall
-        for evaluation in report.evaluations
+        part(summarise(evaluation.outcomes[method].values())).recall for evaluation in report.scored
     ]
+    return _mean(recalls)
+
+
+def _mean_recalls_of_others(
+    others: Sequence[Mapping[str, Accuracy]],
+) -> dict[str, dict[Threshold, float]]:
+    """The same for every name; the sets have the same ones."""
+    return {name: _mean([one[name].recall for one in others]) for name in others[0]}
+
+
+def _mean(recalls: Sequence[Mapping[Threshold, float]]) -> dict[Threshold, float]:
     return {one: float(np.mean([recall[one] for recall in recalls])) for one in THRESHOLDS}
 
 
@@ -318,19 +394,72 @@ def _label(method: Method) -> str:
     return f'{method.name} with {method.matcher}'
 
 
-def _set_row(evaluation: SetEvaluation) -> dict[str, Any]:
+def _summary_rows(report: LocalizationReport) -> dict[str, Any]:
+    """What is said of all sets with truth together."""
+    calibration, curve = _calibration(report)
+    others = _mean_recalls_of_others([_accuracy_of_others(one) for one in report.scored])
     return {
-        **{key: value for key, value in vars(evaluation).items() if key != 'outcomes'},
+        'mean': [
+            {
+                **_method_row(method),
+                **{
+                    name: _recall_rows(_mean_recall(report, method, part))
+                    for name, part in (('found', _found), ('accepted', _accepted))
+                },
+            }
+            for method in report.methods
+        ],
+        'mean_of_others': {name: _recall_rows(recall) for name, recall in others.items()},
+        'confidence': {
+            **_method_row(report.methods[-1]),
+            **asdict(calibration),
+            'recall_without_error': curve.recall_without_error,
+            'precision_recall': {name: value.tolist() for name, value in vars(curve).items()},
+        },
+    }
+
+
+def _set_row(evaluation: SetEvaluation) -> dict[str, Any]:
+    given = {name: value for name, value in vars(evaluation).items() if name not in _PARTS}
+    if evaluation.retrieval is None:
+        return {**given, 'has_truth': False, 'methods': _counted_rows(evaluation)}
+    return {
+        **given,
+        'has_truth': True,
         'retrieval': asdict(evaluation.retrieval),
         'methods': [
             {
                 **_method_row(method),
                 **_score_row(summarise(outcomes.values())),
-                'outcomes': {name: _outcome_row(one) for name, one in outcomes.items()},
+                'outcomes': {
+                    name: {**_outcome_row(one), **_error_row(one.error)}
+                    for name, one in outcomes.items()
+                },
             }
             for method, outcomes in evaluation.outcomes.items()
         ],
+        'others': {
+            name: {
+                'found': _accuracy_row(found),
+                'outcomes': {
+                    image: _error_row(error) for image, error in evaluation.others[name].items()
+                },
+            }
+            for name, found in _accuracy_of_others(evaluation).items()
+        },
     }
+
+
+def _counted_rows(evaluation: SetEvaluation) -> list[dict[str, Any]]:
+    """The methods on a set without truth, with nothing that only a truth could tell."""
+    return [
+        {
+            **_method_row(method),
+            **asdict(tally(outcomes.values())),
+            'outcomes': {name: _outcome_row(one) for name, one in outcomes.items()},
+        }
+        for method, outcomes in evaluation.outcomes.items()
+    ]
 
 
 def _method_row(method: Method) -> dict[str, Any]:
@@ -354,13 +483,23 @@ def _recall_rows(recall: Mapping[Threshold, float]) -> list[dict[str, float]]:
 
 
 def _outcome_row(outcome: Outcome) -> dict[str, Any]:
-    error = outcome.error
+    pose = outcome.camera_from_world
     return {
         'status': outcome.status.name,
-        'position': None if error is None else error.position,
-        'rotation_deg': None if error is None else error.rotation_deg,
         'confidence': outcome.confidence,
         'milliseconds': outcome.milliseconds,
+        'camera_from_world': (
+            None
+            if pose is None
+            else [*quaternion_wxyz(pose).tolist(), *np.asarray(pose.translation).tolist()]
+        ),
+    }
+
+
+def _error_row(error: PoseError | None) -> dict[str, float | None]:
+    return {
+        'position': None if error is None else error.position,
+        'rotation_deg': None if error is None else error.rotation_deg,
     }
 
 

@@ -27,34 +27,33 @@ from synthetic_place import (
 )
 
 from gam_relocalizer.cameras import format_camera
-from gam_relocalizer.errors import CameraError, ImageError, MapError, UsageError
+from gam_relocalizer.errors import CameraError, ImageError
 from gam_relocalizer.evaluation.localization import (
     Outcome,
-    QuerySet,
     calibration_of,
     covisible_images,
     evaluate_set,
     methods_of,
-    own_camera,
-    read_query_set,
     score_retrieval,
     summarise,
-    world_from_map_of,
+    tally,
 )
 from gam_relocalizer.evaluation.metrics import THRESHOLDS
+from gam_relocalizer.evaluation.query_set import read_query_set
 from gam_relocalizer.features.vlad import Vlad
 from gam_relocalizer.geometry import PoseError, pose_error, write_poses
 from gam_relocalizer.localization.localizer import Localizer, LocalizerOptions
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.localization.scenes import Coarse
 from gam_relocalizer.matching.baselines import NearestNeighbourCross, NearestNeighbourRatio
-from gam_relocalizer.scene_map import Manifest, MapFrame
+from gam_relocalizer.scene_map import MapFrame
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
     from gam_relocalizer.evaluation.localization import SetEvaluation
+    from gam_relocalizer.evaluation.query_set import QuerySet
     from gam_relocalizer.features.local import LocalFeatures
     from gam_relocalizer.scene_map import SceneMap
 
@@ -190,8 +189,70 @@ def test_a_row_is_what_the_localizer_does(
         )
 
 
+def test_without_a_truth_the_same_poses_are_found(
+    scene_map: SceneMap, folder: Path, evaluation: SetEvaluation
+) -> None:
+    found = evaluate(replace(read(scene_map, folder), truth={}))
+    assert not found.has_truth
+    assert found.retrieval is None
+    for method, outcomes in evaluation.outcomes.items():
+        for name, expected in outcomes.items():
+            unknown = found.outcomes[method][name]
+            assert unknown.error is None
+            assert unknown.status is expected.status
+            assert (unknown.camera_from_world is None) == (expected.camera_from_world is None)
+            if unknown.camera_from_world is not None:
+                error = pose_error(unknown.camera_from_world, query_pose(int(name[6:8])))
+                assert error.position == pytest.approx(expected.error.position, abs=1e-8)
+
+
+def test_poses_of_others_are_scored_against_the_same_truth(
+    scene_map: SceneMap, folder: Path
+) -> None:
+    moved = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, 0.03]))
+    poses = {name_of(view): moved * query_pose(view) for view in range(QUERIES - 1)}
+    query_set = read(scene_map, folder)
+    describer = Vlad(scene_map.codebook)
+    found = evaluate_set(
+        *(query_set, extractor(), describer, MATCHERS), retrieved_images=10, others={'hloc': poses}
+    )
+    assert set(found.others['hloc']) == set(poses)
+    for error in found.others['hloc'].values():
+        assert error.position == pytest.approx(0.03)
+        assert error.rotation_deg == pytest.approx(0.0, abs=1e-5)
+
+
+def test_every_query_is_seen_by_its_own_camera(
+    scene_map: SceneMap, folder: Path, evaluation: SetEvaluation
+) -> None:
+    query_set, method = read(scene_map, folder), methods_of(tuple(MATCHERS))[0]
+    tele = pycolmap.Camera(
+        camera_id=1, model='SIMPLE_PINHOLE', width=640, height=480, params=[600, 320, 240]
+    )
+    found = evaluate(replace(query_set, cameras={**query_set.cameras, name_of(0): tele}))
+    once, again = (one.outcomes[method] for one in (evaluation, found))
+    assert again[name_of(1)].error == once[name_of(1)].error
+    assert again[name_of(0)].error != once[name_of(0)].error
+
+
 def test_features_of_a_query_are_extracted_once(evaluated: Evaluated) -> None:
     assert evaluated.asked == list(range(QUERIES + 1))
+
+
+def test_pictures_show_where_queries_were_and_the_worst_poses(evaluation: SetEvaluation) -> None:
+    sights, whole = evaluation.sights, list(evaluation.outcomes)[-1]
+    assert sights is not None
+    for view in range(QUERIES):
+        there = query_pose(view).tgt_origin_in_src()
+        np.testing.assert_allclose(sights.positions[name_of(view)], there, atol=1e-9)
+    errors = [evaluation.outcomes[whole][name].error for name in sights.worst]
+    assert [error.position for error in errors] == sorted(
+        (one.error.position for one in evaluation.outcomes[whole].values() if one.error),
+        reverse=True,
+    )
+    for name, illustration in sights.worst.items():
+        assert name_of(int(illustration.image[0, 0, 0])) == name
+        assert illustration.estimate.inliers > 0
 
 
 def test_retrieval_finds_what_is_covisible(evaluation: SetEvaluation) -> None:
@@ -228,25 +289,6 @@ def test_a_map_in_a_frame_of_its_own_is_laid_over_the_reference(
     metric = read(scene_map, folder, reference=tmp_path / 'reference.txt')
     assert not metric.aligned
     np.testing.assert_array_equal(metric.world_from_map.matrix(), pycolmap.Sim3d().matrix())
-
-
-def test_the_similarity_between_map_and_world_is_found(scene_map: SceneMap) -> None:
-    free = replace(scene_map, manifest=replace(scene_map.manifest, frame=MapFrame(metric=False)))
-    poses = [WORLD_FROM_MAP.transform_camera_world(pose) for pose in free.camera_from_map]
-    found = world_from_map_of(free, dict(zip(free.image_names, poses, strict=True)))
-    np.testing.assert_allclose(found.matrix(), WORLD_FROM_MAP.matrix(), atol=1e-9)
-
-
-def test_a_reference_must_know_all_images_of_the_map(scene_map: SceneMap) -> None:
-    free = replace(scene_map, manifest=replace(scene_map.manifest, frame=MapFrame(metric=False)))
-    with pytest.raises(UsageError, match=r'000\.png'):
-        world_from_map_of(free, {'other.png': ring_pose(0)})
-
-
-def test_cameras_in_one_place_fit_no_similarity(scene_map: SceneMap) -> None:
-    free = replace(scene_map, manifest=replace(scene_map.manifest, frame=MapFrame(metric=False)))
-    with pytest.raises(MapError):
-        world_from_map_of(free, dict.fromkeys(free.image_names, ring_pose(0)))
 
 
 @pytest.mark.parametrize('index', [0, 5, 17])
@@ -315,7 +357,8 @@ def test_without_any_covisible_image_retrieval_has_no_recall() -> None:
 
 def outcome(status: Status, position: float | None, confidence: float = 0.0) -> Outcome:
     error = None if position is None else PoseError(position, 10.0 * position)
-    return Outcome(status, error, confidence, milliseconds=20.0)
+    found = None if position is None else pycolmap.Rigid3d()
+    return Outcome(status, error, confidence, 20.0, found)
 
 
 OUTCOMES = (
@@ -339,6 +382,13 @@ def test_poses_without_a_verdict_are_told_apart_from_accepted_ones() -> None:
     assert score.worst_rotation_deg == pytest.approx(1.5)
 
 
+def test_without_a_truth_poses_are_counted() -> None:
+    unknown = [replace(one, error=None) for one in OUTCOMES]
+    counted = tally(unknown)
+    assert (counted.queries, counted.found, counted.accepted) == (5, 4, 2)
+    assert counted.milliseconds == 20.0
+
+
 def test_nothing_accepted_has_no_worst_error() -> None:
     score = summarise(OUTCOMES[2:])
     assert math.isnan(score.worst_position)
@@ -353,49 +403,14 @@ def test_confidence_is_held_against_the_poses_found() -> None:
     assert curve.recall_without_error == pytest.approx(0.6)
 
 
-def test_a_map_knows_its_own_camera(scene_map: SceneMap) -> None:
-    described = {'report': {'cameras': [format_camera(CAMERA)]}}
-    camera = own_camera(replace(scene_map, manifest=manifest_with(scene_map, described)))
-    assert format_camera(camera) == format_camera(CAMERA)
-
-
-@pytest.mark.parametrize(
-    'build',
-    [
-        {},
-        {'report': {}},
-        {'report': 'none'},
-        {'report': {'cameras': 7}},
-        {'report': {'cameras': [7]}},
-        {'report': {'cameras': []}},
-        {'report': {'cameras': [format_camera(CAMERA)] * 2}},
-    ],
-)
-def test_without_exactly_one_camera_the_map_has_none(
-    scene_map: SceneMap, build: dict[str, object]
-) -> None:
-    with pytest.raises(CameraError):
-        own_camera(replace(scene_map, manifest=manifest_with(scene_map, build)))
-
-
-def manifest_with(scene_map: SceneMap, build: dict[str, object]) -> Manifest:
-    return replace(scene_map.manifest, build=build)
-
-
-def test_truth_of_other_images_is_a_usage_error(scene_map: SceneMap, folder: Path) -> None:
-    truth = folder.parent / 'other.txt'
-    write_poses(truth, {'other.png': query_pose(0)})
-    with pytest.raises(UsageError, match=r'other\.png'):
-        read_query_set(scene_map.path, folder, truth, format_camera(CAMERA))
-
-
 def test_an_image_of_another_size_than_the_camera_is_a_camera_error(
     scene_map: SceneMap, folder: Path
 ) -> None:
     half = pycolmap.Camera(
         camera_id=1, model='SIMPLE_PINHOLE', width=320, height=240, params=[250, 160, 120]
     )
-    query_set = replace(read(scene_map, folder), camera=half)
+    query_set = read(scene_map, folder)
+    query_set = replace(query_set, cameras=dict.fromkeys(query_set.names, half))
     with pytest.raises(CameraError, match=r'query 00\.png'):
         evaluate(query_set)
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
+from html import escape
 from typing import TYPE_CHECKING
 
 import pytest
@@ -21,6 +23,7 @@ from gam_relocalizer.evaluation.localization_report import (
     DEFAULT_MATCHERS,
     JSON,
     MARKDOWN,
+    PAGE,
     PRECISION_RECALL,
     RELIABILITY,
     LocalizationReport,
@@ -29,7 +32,7 @@ from gam_relocalizer.evaluation.localization_report import (
     write_report,
 )
 from gam_relocalizer.evaluation.metrics import THRESHOLDS
-from gam_relocalizer.geometry import PoseError
+from gam_relocalizer.geometry import PoseError, rigid3d_from
 from gam_relocalizer.localization.result import Status
 from gam_relocalizer.matching.registry import MATCHER_NAMES
 
@@ -38,14 +41,15 @@ if TYPE_CHECKING:
 
 METHODS = methods_of(('nn-ratio', 'gam'))
 NAMES = ['SR1', 'SR1', 'IR', 'CC', 'SR']
+POSE = rigid3d_from([0.6, 0.0, -0.8, 0.0], [1.0, 2.0, -3.0])
 
 
 def good(position: float) -> Outcome:
-    return Outcome(Status.ACCEPTED, PoseError(position, 10.0 * position), 0.95, 12.0)
+    return Outcome(Status.ACCEPTED, PoseError(position, 10.0 * position), 0.95, 12.0, POSE)
 
 
-REFUSED = Outcome(Status.UNCERTAIN, PoseError(0.2, 1.0), 0.25, 80.0)
-NO_POSE = Outcome(Status.NO_POSE, None, 0.0, 40.0)
+REFUSED = Outcome(Status.UNCERTAIN, PoseError(0.2, 1.0), 0.25, 80.0, POSE)
+NO_POSE = Outcome(Status.NO_POSE, None, 0.0, 40.0, None)
 
 
 def evaluation(
@@ -57,7 +61,7 @@ def evaluation(
     found[METHODS[0]] = dict.fromkeys(by_name, NO_POSE)
     retrieval = RetrievalScore(len(outcomes), 0.125, (0.5, *[0.75] * 8, *[1.0] * 11))
     return SetEvaluation(
-        name, f'id of {name}', metric, 'vlad', aligned, len(outcomes), without, retrieval, found
+        name, f'id of {name}', metric, 'vlad', aligned, len(outcomes), without, retrieval, found, {}
     )
 
 
@@ -170,6 +174,8 @@ def test_json_holds_every_number() -> None:
         'aligned': False,
         'queries': 4,
         'images_without_truth': 2,
+        'has_truth': True,
+        'others': {},
         'retrieval': {
             'queries': 4, 'covisible': 0.125, 'recall': [0.5, *[0.75] * 8, *[1.0] * 11],
         },
@@ -190,14 +196,97 @@ def test_json_holds_every_number() -> None:
         'rotation_deg': 1.0,
         'confidence': 0.25,
         'milliseconds': 80.0,
+        'camera_from_world': pytest.approx([0.6, 0.0, -0.8, 0.0, 1.0, 2.0, -3.0]),
     }
     assert whole['outcomes']['3.png']['position'] is None
+    assert whole['outcomes']['3.png']['camera_from_world'] is None
     assert content['mean'][-1]['accepted'][0]['recall'] == pytest.approx(0.625)
     confidence = content['confidence']
     assert confidence['brier_score'] == pytest.approx((0.75**2 + 3 * 0.05**2) / 4)
     assert confidence['recall_without_error'] == pytest.approx(0.8)
     assert confidence['precision_recall']['thresholds'] == [0.95, 0.25]
     assert [one['count'] for one in confidence['bins']] == [1, 3]
+
+
+def without_truth(name: str, *outcomes: Outcome) -> SetEvaluation:
+    unknown = [replace(one, error=None) for one in outcomes]
+    return replace(evaluation(name, *unknown), retrieval=None)
+
+
+def test_without_truth_there_are_counts_and_nothing_else() -> None:
+    text = markdown(report_of(without_truth('day', good(0.1), REFUSED, NO_POSE)))
+    assert rows_of(text)[0] == ['Coarse', 'Matcher', 'Poses', 'Accepted', 'Time [ms]']
+    assert rows_of(text)[1] == ['SR1', 'nn-ratio', '0/3', '0/3', '40']
+    assert rows_of(text)[5] == ['SR', 'gam', '2/3', '1/3', '40']
+    assert len(sections_of(text)) == 1
+
+
+def test_sets_without_truth_change_no_number_of_the_others() -> None:
+    both = as_json(report_of(without_truth('day', REFUSED), ONE, TWO))
+    scored = as_json(report_of(ONE, TWO))
+    assert both['sets'][1:] == scored['sets']
+    for key in ('mean', 'confidence'):
+        assert both[key] == scored[key]
+    both_text, text = (
+        markdown(report_of(without_truth('day', REFUSED), ONE)),
+        markdown(report_of(ONE)),
+    )
+    assert both_text.startswith(text)
+    assert 'Map day (metric), R = 10, 1 queries:' in both_text
+
+
+def test_json_without_truth_has_no_recall() -> None:
+    content = json.loads(
+        json.dumps(as_json(report_of(without_truth('day', good(0.1), NO_POSE))), allow_nan=False)
+    )
+    assert set(content) == {'kind', 'retrieved_images', 'sets'}
+    (only,) = content['sets']
+    assert not only['has_truth']
+    assert 'retrieval' not in only
+    whole = only['methods'][-1]
+    assert (whole['queries'], whole['found'], whole['accepted']) == (2, 1, 1)
+    assert set(whole) == {
+        'name', 'matcher', 'coarse', 'max_scenes',
+        'queries', 'found', 'accepted', 'milliseconds', 'outcomes',
+    }  # fmt: skip
+    assert whole['outcomes']['1.png'] == {
+        'status': 'NO_POSE',
+        'confidence': 0.0,
+        'milliseconds': 40.0,
+        'camera_from_world': None,
+    }
+
+
+def test_without_truth_there_are_no_figures_of_the_confidence(tmp_path: Path) -> None:
+    write_report(tmp_path, report_of(without_truth('day', good(0.1))))
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {MARKDOWN, JSON} <= names
+    assert not {RELIABILITY, PRECISION_RECALL} & names
+
+
+def test_others_have_a_row_among_all_poses_and_in_the_mean() -> None:
+    errors = {'0.png': PoseError(0.02, 0.1), '1.png': PoseError(0.4, 0.3)}
+    one = replace(ONE, others={'hloc': errors})
+    two = replace(TWO, others={'hloc': {'0.png': PoseError(0.02, 0.1)}})
+    sections = sections_of(markdown(report_of(one, two)))
+    mean, first, second = (row for row in rows_of(sections['All']) if row[:2] == ['hloc', '-'])
+    assert [float(cell.strip('*')) for cell in mean[2:]] == [62.5, 62.5, 62.5, 75.0, 75.0]
+    assert first[2:] == [
+        '**25.0**',
+        '25.0',
+        '25.0',
+        '50.0',
+        '50.0',
+        '0.2100',
+        '**0.200**',
+        '2/4',
+        '-',
+    ]
+    assert second[-2:] == ['1/1', '-']
+    assert 'hloc' not in sections['Accepted']
+    content = json.loads(json.dumps(as_json(report_of(one, two)), allow_nan=False))
+    assert content['sets'][0]['others']['hloc']['outcomes']['1.png']['position'] == 0.4
+    assert content['mean_of_others']['hloc'][0]['recall'] == pytest.approx(0.625)
 
 
 def test_what_is_not_defined_is_null_in_json() -> None:
@@ -213,10 +302,27 @@ def test_what_is_not_defined_is_null_in_json() -> None:
 def test_writes_files_and_nothing_else(tmp_path: Path) -> None:
     report = report_of(ONE, TWO)
     write_report(tmp_path, report)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        MARKDOWN, JSON, RELIABILITY, PRECISION_RECALL,
-    }  # fmt: skip
+    pictures = {RELIABILITY, PRECISION_RECALL, 'errors.png', 'recall.png', 'times.png'}
+    assert {path.name for path in tmp_path.iterdir()} == {MARKDOWN, JSON, PAGE, *pictures}
     assert (tmp_path / MARKDOWN).read_text() == markdown(report)
     assert json.loads((tmp_path / JSON).read_text()) == as_json(report)
-    for name in (RELIABILITY, PRECISION_RECALL):
+    for name in pictures:
         assert (tmp_path / name).read_bytes().startswith(b'\x89PNG')
+
+
+def test_page_tells_what_is_printed(tmp_path: Path) -> None:
+    report = report_of(ONE, TWO, without_truth('day', good(0.1)))
+    write_report(tmp_path, report)
+    text = (tmp_path / PAGE).read_text(encoding='utf-8')
+    assert text.count('<img') == len(list(tmp_path.glob('*.png')))
+    for line in markdown(report).splitlines():
+        if line.startswith('| '):
+            for cell in line.strip('|').split('|'):
+                assert f'>{escape(cell.strip().strip("*"))}<' in text
+
+
+def test_page_of_sets_without_truth_is_whole(tmp_path: Path) -> None:
+    write_report(tmp_path, report_of(without_truth('day', good(0.1), NO_POSE)))
+    text = (tmp_path / PAGE).read_text(encoding='utf-8')
+    assert '1 / 2' in text
+    assert text.endswith('</html>\n')

@@ -10,42 +10,49 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gam_relocalizer.cli.evaluate.outputs import prepare_folder, progress_bars
+from gam_relocalizer.cli.evaluate.query_options import (
+    CameraOption,
+    DatasetOption,
+    EveryOption,
+    LayoutOption,
+    MapsOption,
+    QueriesOption,
+    QueryListOption,
+    QueryOptions,
+    ReferenceOption,
+    TruthOption,
+    check_global_weights,
+    check_one_per_map,
+    read_query_sets,
+)
 from gam_relocalizer.cli.options import GlobalWeightsOption
 from gam_relocalizer.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from gam_relocalizer.scene_map import SceneMap
+    import pycolmap
+
+    from gam_relocalizer.evaluation.query_set import QuerySet
 
 
 def localization(  # noqa: PLR0913 - one argument per option
-    maps: Annotated[
-        list[Path], typer.Option('--map', help='A map bundle; may be given repeatedly.')
-    ],
-    queries: Annotated[
-        list[Path], typer.Option(help='The folder of images to localize, one per --map.')
-    ],
-    truth: Annotated[
-        list[Path],
-        typer.Option(
-            help='Their true poses, one file per --map: lines `name qw qx qy qz tx ty tz`, '
-            'camera_from_world. Images it does not name are left out.'
-        ),
-    ],
+    maps: MapsOption,
     *,
-    camera: Annotated[
+    queries: QueriesOption = None,
+    truth: TruthOption = None,
+    query_list: QueryListOption = None,
+    dataset: DatasetOption = None,
+    layout: LayoutOption = None,
+    camera: CameraOption = None,
+    reference: ReferenceOption = None,
+    every: EveryOption = 1,
+    results: Annotated[
         list[str] | None,
         typer.Option(
-            help='Their camera, one per --map: file or text `MODEL WIDTH HEIGHT PARAMS...`; by '
-            'default the one that took the images of the map.'
-        ),
-    ] = None,
-    reference: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help='True poses of the images of the map, one file per --map: lays a map that is not '
-            'metric over the truth by a similarity.'
+            metavar='NAME=FILE',
+            help='Poses of the same images that another localizer found, as hloc writes them: a '
+            'row NAME in the tables. One file per --map for every NAME.',
         ),
     ] = None,
     matcher: Annotated[
@@ -59,35 +66,50 @@ def localization(  # noqa: PLR0913 - one argument per option
     retrieved: Annotated[int, typer.Option(min=1, help='Reference images retrieved, R.')] = 10,
     out: Annotated[
         Path | None,
-        typer.Option(help='Folder for localization.md, localization.json and figures.'),
+        typer.Option(help='Folder for localization.md, localization.json, figures and submission.'),
     ] = None,
 ) -> None:
     """Localize images with known poses: matchers and ways to choose scenes, compared.
 
     Recall is the share of the images within a position and an angle of the truth; once for all
-    poses that were found, as in papers, and once for those that the verdict accepted.
+    poses that were found, as in papers, and once for those that the verdict accepted. Without a
+    truth the poses are counted, and written as the long-term localization benchmark wants them.
     """
-    from gam_relocalizer.evaluation.localization import evaluate_set, read_query_set
+    from gam_relocalizer.evaluation.localization import evaluate_set
     from gam_relocalizer.evaluation.localization_report import (
         DEFAULT_MATCHERS,
         LocalizationReport,
         markdown,
         write_report,
     )
+    from gam_relocalizer.evaluation.submission import (
+        SUBMISSION,
+        submission_names,
+        write_submission,
+    )
     from gam_relocalizer.features.registry import create_extractor, global_descriptor_of
     from gam_relocalizer.matching.registry import create_matcher
 
-    cameras: Sequence[str | None] = camera or [None] * len(maps)
-    references: Sequence[Path | None] = reference or [None] * len(maps)
-    _check_sets(maps, queries=queries, truth=truth, camera=cameras, reference=references)
-    query_sets = [
-        read_query_set(*one) for one in zip(maps, queries, truth, cameras, references, strict=True)
-    ]
-    _check_global_weights(global_weights, [one.scene_map for one in query_sets])
+    query_sets = read_query_sets(
+        QueryOptions(
+            maps=maps,
+            queries=queries,
+            truth=truth,
+            query_list=query_list,
+            dataset=dataset,
+            layout=layout,
+            camera=camera,
+            reference=reference,
+            every=every,
+        )
+    )
+    check_global_weights(global_weights, [one.scene_map for one in query_sets])
+    others = _read_others(results or [], maps, query_sets)
+    submitted = submission_names(name for one in query_sets if not one.truth for name in one.names)
     if out is not None:
         prepare_folder(out)
     evaluations = []
-    for query_set in query_sets:
+    for query_set, found_by_others in zip(query_sets, others, strict=True):
         scene_map, manifest = query_set.scene_map, query_set.scene_map.manifest
         extractor = manifest.extractor.name
         describer = global_descriptor_of(
@@ -105,25 +127,36 @@ def localization(  # noqa: PLR0913 - one argument per option
                     matchers,
                     retrieved,
                     progress,
+                    found_by_others,
                 )
             )
     report = LocalizationReport(evaluations, retrieved)
     typer.echo(markdown(report), nl=False)
     if out is not None:
         write_report(out, report)
+        if submitted:
+            write_submission(out / SUBMISSION, evaluations, submitted)
 
 
-def _check_sets(maps: Sequence[Path], **given: Sequence[object]) -> None:
-    for name, values in given.items():
-        if len(values) != len(maps):
-            msg = (
-                f'every --map needs its own --{name}, in the same order: found {len(maps)} maps '
-                f'and {len(values)} of --{name}'
-            )
+def _read_others(
+    results: Sequence[str], maps: Sequence[Path], query_sets: Sequence[QuerySet]
+) -> list[dict[str, dict[str, pycolmap.Rigid3d]]]:
+    """Per set, what others found: poses by name of the localizer and of the image."""
+    from gam_relocalizer.evaluation.submission import read_results
+
+    files: dict[str, list[Path]] = {}
+    for given in results:
+        name, equals, file = given.partition('=')
+        if not (name and equals and file):
+            msg = f'--results {given}: expected NAME=FILE'
             raise UsageError(msg)
-
-
-def _check_global_weights(weights: Path | None, scene_maps: Sequence[SceneMap]) -> None:
-    if weights is not None and not any(one.manifest.retrieval_weights_sha256 for one in scene_maps):
-        msg = f'{weights}: none of the maps has a global descriptor with weights; leave them out'
+        files.setdefault(name, []).append(Path(file))
+    if files and not all(query_set.truth for query_set in query_sets):
+        msg = '--results: poses of others can only be scored where the truth is known'
         raise UsageError(msg)
+    for name, of_name in files.items():
+        check_one_per_map(maps, f'--results {name}=', of_name)
+    return [
+        {name: read_results(of_name[index], one.names) for name, of_name in files.items()}
+        for index, one in enumerate(query_sets)
+    ]
