@@ -139,16 +139,42 @@ def record_mapping_pass(
     if views is None:
         views = trajectories.mapping_views(world.mapping_route)
     shots = [Shot((view,), seed) for seed, view in enumerate(views)]
-    names = [f'{index:04d}.jpg' for index in range(len(shots))]
-    with _renamed_when_complete(out_dir) as folder:
-        (folder / 'images').mkdir(parents=True)
-        rendered = _rendered(world, mapping_appearance(world), camera, shots, workers)
-        for done, (name, image) in enumerate(zip(names, rendered, strict=True), start=1):
-            (folder / 'images' / name).write_bytes(_jpeg(image))
-            if progress:
-                progress(done, len(shots))
-        write_text(folder / 'camera.txt', f'{format_camera(camera)}\n')
-        write_poses(folder / 'poses.txt', dict(zip(names, views, strict=True)))
+    images = _rendered(world, mapping_appearance(world), camera, shots, workers)
+    _write_images(out_dir, images, views, camera, progress)
+
+
+def record_drive_images(
+    world: World,
+    out_dir: Path,
+    *,
+    period_s: float,
+    duration_s: float | None = None,
+    camera: pycolmap.Camera | None = None,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> None:
+    """Writes images of the robot's drive as `record_mapping_pass` writes those of the walk.
+
+    Args:
+        world: Where to drive.
+        out_dir: Folder to make or to replace.
+        period_s: From one image to the next [s].
+        duration_s: Only this much of the drive [s]; all of it if not given.
+        camera: A pinhole camera; `robot_camera()` if not given.
+        workers: Processes that render; 1 renders in this one.
+        progress: Called with the images done and their total.
+    """
+    camera = camera or robot_camera()
+    appearance = drive_appearance(world)
+    drive = trajectories.drive(world.drive_route)
+    duration = drive.duration if duration_s is None else min(duration_s, drive.duration)
+    times = [index * period_s for index in range(int(duration / period_s) + 1)]
+    shots = [
+        Shot(_exposure(drive, t, appearance.exposure_time, camera), seed)
+        for seed, t in enumerate(times)
+    ]
+    images = _rendered(world, appearance, camera, shots, workers)
+    _write_images(out_dir, images, [drive.camera_from_map(t) for t in times], camera, progress)
 
 
 def record_query_bag(
@@ -370,6 +396,25 @@ def _exposure(
     count = STILL_SAMPLES * (1 if reach * camera.mean_focal_length() < STILL_SAMPLES else 2)
     moments = ((np.arange(count) + 0.5) / count - 0.5) * exposure_time
     return tuple(drive.camera_from_map(t + float(moment)) for moment in moments)
+
+
+def _write_images(
+    out_dir: Path,
+    images: Iterator[NDArray[np.uint8]],
+    views: Sequence[pycolmap.Rigid3d],
+    camera: pycolmap.Camera,
+    progress: Progress | None,
+) -> None:
+    """A folder of images with their camera and poses (camera_from_map)."""
+    names = [f'{index:04d}.jpg' for index in range(len(views))]
+    with _renamed_when_complete(out_dir) as folder:
+        (folder / 'images').mkdir(parents=True)
+        for done, (name, image) in enumerate(zip(names, images, strict=True), start=1):
+            (folder / 'images' / name).write_bytes(_jpeg(image))
+            if progress:
+                progress(done, len(views))
+        write_text(folder / 'camera.txt', f'{format_camera(camera)}\n')
+        write_poses(folder / 'poses.txt', dict(zip(names, views, strict=True)))
 
 
 def _rendered(

@@ -100,6 +100,28 @@ def test_mapping_pass_is_images_with_their_camera_and_poses(
     assert np.abs(image.astype(int) - truth).mean() < 4.0
 
 
+def test_images_of_the_drive_show_what_the_bag_shows(
+    tiny: World, bag: Path, bag_camera: pycolmap.Camera, tmp_path: Path
+) -> None:
+    out = tmp_path / 'drive'
+    recording.record_drive_images(
+        tiny, out, period_s=0.2, duration_s=DURATION, camera=bag_camera, workers=1
+    )
+    drive = trajectories.drive(tiny.drive_route)
+    poses = read_poses(out / 'poses.txt')
+    recorded = [message for _, message in _messages(bag, recording.IMAGE_TOPIC)]
+    assert len(poses) == len(recorded) == IMAGES
+    for index, (name, message) in enumerate(zip(sorted(poses), recorded, strict=True)):
+        error = pose_error(poses[name], drive.camera_from_map(0.2 * index))
+        assert error.position < 1e-9
+        assert error.rotation_deg < 1e-5
+        image = cv2.cvtColor(cv2.imread(str(out / 'images' / name)), cv2.COLOR_BGR2RGB)
+        same = message.data.reshape(image.shape).astype(int)
+        assert np.abs(image - same).mean() < 4.0
+    camera = parse_camera(out / 'camera.txt')
+    np.testing.assert_array_equal(camera.params, bag_camera.params)
+
+
 def test_worker_processes_render_the_same_bytes(
     tiny: World, small_camera: pycolmap.Camera, tmp_path: Path
 ) -> None:

@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import typer
 
-from gam_relocalizer.cli.evaluate import localization, matching
+from gam_relocalizer.cli.evaluate import localization, matching, timing
 
 app = typer.Typer(help='Measure how good the parts are.', no_args_is_help=True)
 app.command()(matching.matching)
 app.command()(localization.localization)
+app.command()(timing.timing)
