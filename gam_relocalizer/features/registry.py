@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gam_relocalizer.errors import MapError, UsageError
@@ -36,13 +37,23 @@ def create_extractor(
         UsageError: Unknown name, or `max_keypoints` below 1.
         WeightsError: The extractor's package or weights are missing or damaged.
     """
-    if name not in _FACTORIES:
-        msg = f'unknown extractor `{name}`; known are {", ".join(EXTRACTOR_NAMES)}'
-        raise UsageError(msg)
+    known = _known(name)
     if max_keypoints < 1:
         msg = f'max_keypoints must be at least 1, found {max_keypoints}'
         raise UsageError(msg)
-    return _FACTORIES[name](max_keypoints)
+    return known.create(max_keypoints)
+
+
+def min_similarity_of(name: str) -> float:
+    """Least cosine of two descriptors that may be the same point, when a map is built.
+
+    Args:
+        name: One of `EXTRACTOR_NAMES`.
+
+    Raises:
+        UsageError: Unknown name.
+    """
+    return _known(name).min_similarity
 
 
 def load_global_descriptor(name: str, weights: Path | None) -> GlobalDescriptor | None:
@@ -120,6 +131,26 @@ def _sift(max_keypoints: int) -> LocalExtractor:
     return SiftExtractor(max_keypoints)
 
 
-# Imported on demand: torch alone takes seconds.
-_FACTORIES: dict[str, Callable[[int], LocalExtractor]] = {'xfeat': _xfeat, 'sift': _sift}
-EXTRACTOR_NAMES = tuple(_FACTORIES)
+@dataclass(frozen=True)
+class _Extractor:
+    """What there is to know of an extractor before it is made.
+
+    Attributes:
+        create: Makes one that keeps the best so many keypoints. Its module is imported on demand:
+            torch alone takes seconds.
+        min_similarity: Least cosine of two descriptors that may be the same point.
+    """
+
+    create: Callable[[int], LocalExtractor]
+    min_similarity: float
+
+
+_EXTRACTORS = {'xfeat': _Extractor(_xfeat, 0.82), 'sift': _Extractor(_sift, 0.80)}
+EXTRACTOR_NAMES = tuple(_EXTRACTORS)
+
+
+def _known(name: str) -> _Extractor:
+    if name not in _EXTRACTORS:
+        msg = f'unknown extractor `{name}`; known are {", ".join(EXTRACTOR_NAMES)}'
+        raise UsageError(msg)
+    return _EXTRACTORS[name]

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from gam_relocalizer.features.registry import min_similarity_of
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -18,8 +20,6 @@ if TYPE_CHECKING:
     from gam_relocalizer.mapping.extraction import MappingImage
     from gam_relocalizer.mapping.progress import Progress
 
-# Least cosine of two descriptors that may be the same point.
-_MIN_SIMILARITY = {'xfeat': 0.82, 'sift': 0.80}
 # Repeated windows and tiles lead whole images astray; a mild test costs one true match in six.
 _MAX_RATIO = 0.95
 _BLOCK = 4096
@@ -39,12 +39,13 @@ def match_pairs(
         extractor: Its name, which tells how alike descriptors of one thing are.
         progress: Told of the step match.
     """
+    min_similarity = min_similarity_of(extractor)
     matches: dict[tuple[int, int], NDArray[np.int64]] = {}
     for done, (first, second) in enumerate(pairs, start=1):
         matches[first, second] = mutual_nearest_neighbours(
             images[first].features.descriptors,
             images[second].features.descriptors,
-            _MIN_SIMILARITY[extractor],
+            min_similarity,
             _MAX_RATIO,
         )
         progress('match', done, len(pairs))
