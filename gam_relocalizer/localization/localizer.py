@@ -42,6 +42,7 @@ from gam_relocalizer.localization.result import (
 from gam_relocalizer.localization.retrieval import retrieve
 from gam_relocalizer.localization.scenes import Coarse, distinct, orientation_kept
 from gam_relocalizer.localization.search import candidates, search
+from gam_relocalizer.localization.sharpening import sharpened
 from gam_relocalizer.localization.support import support_of
 from gam_relocalizer.localization.verdict import (
     VerdictOptions,
@@ -292,8 +293,22 @@ class Localizer:
             estimate = self._estimate(pose, matches, scene, query)
             verdict = self._judge(estimate, scene, query)
             confidence = estimate.belief * nearness(estimate.covariance)
+        with query.clock.stage('pose'):
+            estimate = self._sharpened(estimate, scene, query)
         found = replace(result, estimate=estimate, confidence=confidence)
         return found.judged(verdict.status, verdict.reason)
+
+    def _sharpened(self, estimate: PoseEstimate, scene: Scene, query: _Query) -> PoseEstimate:
+        """The same with a pose that more matches speak for; what was judged stays as it is."""
+        camera_from_map = sharpened(
+            estimate.camera_from_map,
+            estimate.covariance,
+            query.features,
+            query.camera,
+            scene.points,
+            self._scene_map,
+        )
+        return replace(estimate, camera_from_map=camera_from_map)
 
     def _judge(self, estimate: PoseEstimate, scene: Scene, query: _Query) -> Verdict:
         """The cheap checks first; the others only for a pose that would be accepted."""

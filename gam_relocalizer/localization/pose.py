@@ -153,6 +153,37 @@ def estimate_pose(
     )
 
 
+def refined_pose(
+    camera_from_map: pycolmap.Rigid3d,
+    keypoints: NDArray[np.float64],
+    points: NDArray[np.float64],
+    camera: pycolmap.Camera,
+) -> pycolmap.Rigid3d | None:
+    """A pose that is nearly right, refined on matches that all belong to it.
+
+    Args:
+        camera_from_map: Where to start.
+        keypoints: [K,2] pixels, COLMAP convention.
+        points: [K,3] matched points, map frame.
+        camera: Any model of COLMAP.
+
+    Returns:
+        The pose, or nothing where the matches do not determine one.
+    """
+    local = _LocalFrame.around(points)
+    everything = np.ones(len(points), np.bool_)
+    errors = reprojection_errors(camera_from_map, keypoints, points, camera)
+    found = _minimised(
+        local.pose_from_map(camera_from_map),
+        keypoints,
+        local.from_map(points),
+        everything,
+        errors,
+        camera,
+    )
+    return None if found is None else local.pose_to_map(found)
+
+
 def reprojection_errors(
     camera_from_map: pycolmap.Rigid3d,
     keypoints: NDArray[np.float64],
@@ -186,6 +217,12 @@ class _LocalFrame:
     def from_map(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         local: NDArray[np.float64] = (points - self.centre) / self.unit
         return local
+
+    def pose_from_map(self, camera_from_map: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
+        translation = camera_from_map * self.centre
+        return pycolmap.Rigid3d(
+            rotation=camera_from_map.rotation, translation=translation / self.unit
+        )
 
     def pose_to_map(self, camera_from_local: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
         rotation = camera_from_local.rotation
@@ -321,25 +358,40 @@ def _refine(camera_from_local: pycolmap.Rigid3d, matches: _Matches) -> _Refined 
         if np.count_nonzero(inliers) < MIN_MATCHES:
             return None
         exact = matches.exact(inliers)
-        refined = pycolmap.refine_absolute_pose(
-            camera_from_local,
-            matches.keypoints,
-            matches.points,
-            exact,
-            matches.camera,
-            pycolmap.AbsolutePoseRefinementOptions(
-                gradient_tolerance=1e-6, loss_function_scale=cauchy_scale(errors[exact])
-            ),
+        refined = _minimised(
+            camera_from_local, matches.keypoints, matches.points, exact, errors, matches.camera
         )
         if refined is None:
             return None
-        camera_from_local = refined['cam_from_world']
+        camera_from_local = refined
         threshold = matches.tightened_threshold(matches.errors(camera_from_local))
     errors = matches.errors(camera_from_local)
     inliers = matches.inliers(errors, threshold)
     if np.count_nonzero(inliers) < MIN_MATCHES:
         return None
     return _Refined(camera_from_local, inliers, matches.exact(inliers), errors)
+
+
+def _minimised(
+    camera_from_local: pycolmap.Rigid3d,
+    keypoints: NDArray[np.float64],
+    points: NDArray[np.float64],
+    inliers: NDArray[np.bool_],
+    errors: NDArray[np.float64],
+    camera: pycolmap.Camera,
+) -> pycolmap.Rigid3d | None:
+    """The pose of the least robust reprojection error of the inliers [K] nearby."""
+    found = pycolmap.refine_absolute_pose(
+        camera_from_local,
+        keypoints,
+        points,
+        inliers,
+        camera,
+        pycolmap.AbsolutePoseRefinementOptions(
+            gradient_tolerance=1e-6, loss_function_scale=cauchy_scale(errors[inliers])
+        ),
+    )
+    return None if found is None else found['cam_from_world']
 
 
 def _numbered(rows: NDArray[Any]) -> NDArray[np.int64]:
