@@ -89,6 +89,11 @@ class Components:
         """All but local features and global descriptor: the paper's time over R."""
         return self.total - self.local_features - self.global_descriptor
 
+    @property
+    def to_pose(self) -> float:
+        """The same until there is a pose, believed or not: what all methods do."""
+        return self.elapsed - self.verdict
+
 
 @dataclass(frozen=True)
 class Run:
@@ -153,12 +158,14 @@ class TimedScore:
     Attributes:
         found: Errors of all poses found, whatever the verdict, as in the paper.
         accepted: Number of accepted poses; None for a method without a verdict.
+        to_pose: Without local features, global descriptor and verdict.
         elapsed: Without local features and global descriptor, as in the paper.
         whole: With them.
     """
 
     found: Accuracy
     accepted: int | None
+    to_pose: Averages
     elapsed: Averages
     whole: Averages
 
@@ -168,10 +175,13 @@ class Speedup:
     """How many times as long image matching takes, with the same number of retrieved images.
 
     Attributes:
-        elapsed: Ratios of mean and of median times, without local features and global descriptor.
-        whole: The same with them.
+        to_pose: Ratios of mean and of median times, without local features and global descriptor,
+            until there is a pose.
+        elapsed: The same with the verdict of the localizer; image matching has none.
+        whole: The same with local features and global descriptor as well.
     """
 
+    to_pose: Averages
     elapsed: Averages
     whole: Averages
 
@@ -248,6 +258,7 @@ def summarise(runs: Iterable[Run]) -> TimedScore:
     return TimedScore(
         found=accuracy([one.error for one in every if one.error is not None], len(every)),
         accepted=sum(verdicts) if verdicts else None,
+        to_pose=averages([one.components.to_pose for one in every]),
         elapsed=averages([one.components.elapsed for one in every]),
         whole=averages([one.components.total for one in every]),
     )
@@ -259,22 +270,24 @@ def averages(values: Sequence[float]) -> Averages:
 
 
 def speedup_of(timing: SetTiming) -> Speedup | None:
-    """How much longer image matching takes at the localizer's default; None where it did not run.
-
-    The time of the localizer counts with its verdict, which image matching has none of.
-    """
+    """How much longer image matching takes at the localizer's default; None if it did not run."""
     if Method.IMAGES not in timing.runs:
         return None
     scenes, images = (
         summarise(timing.runs[method][COMPARED_COUNT].values())
         for method in (Method.SCENES, Method.IMAGES)
     )
-    return Speedup(_ratio(images.elapsed, scenes.elapsed), _ratio(images.whole, scenes.whole))
+    return Speedup(
+        to_pose=_ratio(images.to_pose, scenes.to_pose),
+        elapsed=_ratio(images.elapsed, scenes.elapsed),
+        whole=_ratio(images.whole, scenes.whole),
+    )
 
 
 def mean_speedup(speedups: Sequence[Speedup]) -> Speedup:
     """The geometric mean over at least one set."""
     return Speedup(
+        to_pose=_geometric_mean([one.to_pose for one in speedups]),
         elapsed=_geometric_mean([one.elapsed for one in speedups]),
         whole=_geometric_mean([one.whole for one in speedups]),
     )

@@ -166,6 +166,7 @@ def test_times_faster_is_the_ratio_of_the_times(timing: SetTiming) -> None:
         },
     )
     speedup = speedup_of(made_up)
+    assert speedup.to_pose == speedup.elapsed  # nobody has a verdict here
     assert speedup.elapsed.mean == pytest.approx(3000.0 / 90.0)
     assert speedup.elapsed.median == pytest.approx(40.0)
     assert speedup.whole.mean == pytest.approx(3300.0 / 390.0)
@@ -173,9 +174,10 @@ def test_times_faster_is_the_ratio_of_the_times(timing: SetTiming) -> None:
 
 
 def test_ratios_are_averaged_so_that_twice_and_half_cancel() -> None:
-    twice = Speedup(Averages(2.0, 8.0), Averages(1.0, 3.0))
-    half = Speedup(Averages(0.5, 2.0), Averages(1.0, 3.0))
+    twice = Speedup(Averages(4.0, 9.0), Averages(2.0, 8.0), Averages(1.0, 3.0))
+    half = Speedup(Averages(1.0, 4.0), Averages(0.5, 2.0), Averages(1.0, 3.0))
     mean = mean_speedup([twice, half])
+    assert astuple(mean.to_pose) == pytest.approx((2.0, 6.0))
     assert astuple(mean.elapsed) == pytest.approx((1.0, 4.0))
     assert astuple(mean.whole) == pytest.approx((1.0, 3.0))
     assert astuple(mean_speedup([twice]).elapsed) == pytest.approx((2.0, 8.0))
