@@ -17,8 +17,15 @@ from rich.table import Table
 from gam_relocalizer.cameras import format_camera, parse_camera
 from gam_relocalizer.cli.options import (
     DEFAULT_MATCHER,
+    BaseFrameOption,
+    CameraInfoTopicOption,
+    CameraOption,
     GlobalWeightsOption,
+    ImageIsRectifiedOption,
+    ImageTopicOption,
+    MapFrameOption,
     MatcherOption,
+    TruthTopicOption,
     WeightsOption,
 )
 
@@ -48,12 +55,8 @@ def replay(  # noqa: PLR0913 - the options of the command
     period: Annotated[
         float, typer.Option(min=0.0, help='Seconds between attempts; 0 takes every image.')
     ] = 2.0,
-    image_topic: Annotated[
-        str | None, typer.Option(help='Image or CompressedImage; needed when there are several.')
-    ] = None,
-    camera_info_topic: Annotated[
-        str | None, typer.Option(help='CameraInfo; by default the one beside the image topic.')
-    ] = None,
+    image_topic: ImageTopicOption = None,
+    camera_info_topic: CameraInfoTopicOption = None,
     odom_topic: Annotated[
         str | None,
         typer.Option(
@@ -61,20 +64,11 @@ def replay(  # noqa: PLR0913 - the options of the command
             'agree by it correct its drift.'
         ),
     ] = None,
-    truth_topic: Annotated[
-        str | None, typer.Option(help='True poses of the base in the map frame, to compare with.')
-    ] = None,
-    base_frame: Annotated[
-        str, typer.Option(help='Frame whose pose is wanted; empty: that of the camera.')
-    ] = 'base_link',
-    map_frame: Annotated[str, typer.Option(help='Name of the frame of the poses.')] = 'map',
-    camera: Annotated[
-        str | None,
-        typer.Option(help='File or text `MODEL WIDTH HEIGHT PARAMS...`; overrides CameraInfo.'),
-    ] = None,
-    image_is_rectified: Annotated[
-        bool, typer.Option('--image-is-rectified', help='Use P of the CameraInfo, no distortion.')
-    ] = False,
+    truth_topic: TruthTopicOption = None,
+    base_frame: BaseFrameOption = 'base_link',
+    map_frame: MapFrameOption = 'map',
+    camera: CameraOption = None,
+    image_is_rectified: ImageIsRectifiedOption = False,
     matcher: MatcherOption = DEFAULT_MATCHER,
     weights: WeightsOption = None,
     global_weights: GlobalWeightsOption = None,
