@@ -212,7 +212,7 @@ class Localizer:
         described: NDArray[np.float32],
         camera: pycolmap.Camera,
     ) -> list[LocalizationResult]:
-        """One result for every scene tried, before they are held against each other."""
+        """One result for every scene tried, not yet held against each other, nor sharpened."""
         return self._attempts(_Query(_seen_by(camera, features), described, camera))
 
     def _judge_mirrored(
@@ -247,7 +247,11 @@ class Localizer:
                 Status.NO_SCENE,
                 f'no reference image was retrieved; the map has {self._scene_map.num_images}',
             )
-        return replace(self._uncontested(attempts), scenes_tried=len(attempts))
+        best = replace(self._uncontested(attempts), scenes_tried=len(attempts))
+        if best.estimate is None:
+            return best
+        with query.clock.stage('pose'):
+            return replace(best, estimate=self._sharpened(best.estimate, best.scene, query))
 
     def _attempts(self, query: _Query) -> list[LocalizationResult]:
         ordered = candidates(query.described, self._scene_map, self._options, query.prior.hint)
@@ -271,10 +275,23 @@ class Localizer:
                 return best.judged(verdict.status, verdict.reason)
         return best
 
+    def _sharpened(self, estimate: PoseEstimate, scene: str, query: _Query) -> PoseEstimate:
+        """The same with a pose that more matches speak for; what was judged stays as it is."""
+        camera_from_map = sharpened(
+            estimate.camera_from_map,
+            estimate.covariance,
+            query.features,
+            query.camera,
+            query.scenes[scene].points,
+            self._scene_map,
+        )
+        return replace(estimate, camera_from_map=camera_from_map)
+
     def _localize_in(self, scene: Scene, query: _Query) -> LocalizationResult:
         with query.clock.stage('matching'):
             matches = self._match(scene, query)
         name = self._scene_map.image_names[scene.image]
+        query.scenes[name] = scene
         result = LocalizationResult(
             Status.TOO_FEW_MATCHES,
             matches=len(distinct(matches.keypoint_indices)),
@@ -293,22 +310,8 @@ class Localizer:
             estimate = self._estimate(pose, matches, scene, query)
             verdict = self._judge(estimate, scene, query)
             confidence = estimate.belief * nearness(estimate.covariance)
-        with query.clock.stage('pose'):
-            estimate = self._sharpened(estimate, scene, query)
         found = replace(result, estimate=estimate, confidence=confidence)
         return found.judged(verdict.status, verdict.reason)
-
-    def _sharpened(self, estimate: PoseEstimate, scene: Scene, query: _Query) -> PoseEstimate:
-        """The same with a pose that more matches speak for; what was judged stays as it is."""
-        camera_from_map = sharpened(
-            estimate.camera_from_map,
-            estimate.covariance,
-            query.features,
-            query.camera,
-            scene.points,
-            self._scene_map,
-        )
-        return replace(estimate, camera_from_map=camera_from_map)
 
     def _judge(self, estimate: PoseEstimate, scene: Scene, query: _Query) -> Verdict:
         """The cheap checks first; the others only for a pose that would be accepted."""
@@ -420,13 +423,14 @@ class _Clock:
 
 @dataclass(frozen=True)
 class _Query:
-    """An image as the search for its pose knows it."""
+    """An image as the search for its pose knows it, and the scenes tried, by their image."""
 
     features: LocalFeatures
     described: NDArray[np.float32]
     camera: pycolmap.Camera
     prior: Prior = field(default_factory=Prior)
     clock: _Clock = field(default_factory=_Clock)
+    scenes: dict[str, Scene] = field(default_factory=dict)
 
 
 def _timed(scenes: Iterator[Candidate], clock: _Clock) -> Iterator[Candidate]:
