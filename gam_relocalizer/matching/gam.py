@@ -13,7 +13,7 @@ from gam_relocalizer.matching.bmnet import normalise_points
 from gam_relocalizer.matching.candidates import knn_ratio
 from gam_relocalizer.matching.graph import CandidateGraphs
 from gam_relocalizer.matching.matcher import Matches, have_finite_places
-from gam_relocalizer.matching.pooling import hungarian_pooling, numbered
+from gam_relocalizer.matching.pooling import hungarian_pooling
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -79,8 +79,8 @@ class Gam:
         self, edges: NDArray[np.int64], distances: NDArray[np.float32], given: MatchInput
     ) -> NDArray[np.float32]:
         """Probabilities [T] of the edges; the network sees nothing that has no edge."""
-        used_keypoints, rows = numbered(edges[:, 0])
-        used_points, columns = numbered(edges[:, 1])
+        used_keypoints, rows = np.unique(edges[:, 0], return_inverse=True)
+        used_points, columns = np.unique(edges[:, 1], return_inverse=True)
         keypoints = np.asarray(given.keypoints[used_keypoints], np.float32)
         graph = CandidateGraphs(
             torch.from_numpy(keypoints)[:, None],

@@ -31,8 +31,8 @@ def hungarian_pooling(edges: NDArray[np.int64], weights: NDArray[Any]) -> NDArra
     chosen = np.zeros(len(edges), dtype=bool)
     if not len(edges):
         return chosen
-    keypoints, rows = numbered(edges[:, 0])
-    points, columns = numbered(edges[:, 1])
+    keypoints, rows = np.unique(edges[:, 0], return_inverse=True)
+    points, columns = np.unique(edges[:, 1], return_inverse=True)
     heaviest_first = np.argsort(-np.asarray(weights, np.float64), kind='stable')
     pairs = rows * len(points) + columns
     ordered_pairs, first = np.unique(pairs[heaviest_first], return_index=True)
@@ -61,13 +61,6 @@ def hungarian_pooling(edges: NDArray[np.int64], weights: NDArray[Any]) -> NDArra
     matched_pairs = matched_rows[real] * np.int64(len(points)) + matched_columns[real]
     chosen[edge_of_pair[np.searchsorted(ordered_pairs, matched_pairs)]] = True
     return chosen
-
-
-def numbered(indices: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The distinct ones of some indices [T], rising, and which of them each index is [T]."""
-    used = np.zeros(indices.max(initial=-1) + 1, np.bool_)
-    used[indices] = True
-    return np.flatnonzero(used), (np.cumsum(used) - 1)[indices]
 
 
 class _HungarianPooling(torch.autograd.Function):
