@@ -58,6 +58,8 @@ if TYPE_CHECKING:
 
 # A map whose scale is less certain misleads a planner more than one without.
 MAX_SCALE_SIGMA = 0.05
+# So large a share of what is given may disagree with a map before something must be said.
+MAX_UNUSED = 0.1
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -276,6 +278,15 @@ def _report(
                 'the cameras stand on their heads in this frame: its z points down, or it is '
                 'left-handed; a robot needs z up (REP-103)'
             )
+        warnings = (*warnings, note)
+    unused = [one.metres for one in residuals if not one.inlier]
+    if len(unused) > MAX_UNUSED * len(residuals):
+        note = (
+            f'{len(unused)} of {len(residuals)} do not agree with the map, by up to '
+            f'{max(unused):.3g} m: either they are wrong, or a part of the map is in a wrong '
+            f'place, as where two places look the same; do not run a robot by it before '
+            f'`map check` and the pictures of the build have told which'
+        )
         warnings = (*warnings, note)
     findings = replace(findings, roll_median_deg=roll_median_deg(axes, _UP), warnings=warnings)
     return AlignmentReport(method, frame, residuals, findings=findings)

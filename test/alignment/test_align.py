@@ -71,6 +71,7 @@ def test_poses_lay_the_map_where_they_are(room: SurveyedRoom) -> None:
     assert report.frame.metric
     assert report.residual_median == pytest.approx(0.03, abs=0.015)
     assert report.residual_median_deg == pytest.approx(0.88, abs=0.4)
+    assert report.findings.warnings == ()
 
 
 def test_poses_of_a_straight_drive_settle_the_roll_too(corridor: SurveyedRoom) -> None:
@@ -107,6 +108,7 @@ def test_positions_with_a_third_of_gross_errors_lay_the_map_right(room: Surveyed
 
     assert room.errors()[0] < 0.03
     assert {one.name for one in report.residuals if not one.inlier} == set(wrong)
+    assert any('wrong place' in warning for warning in report.findings.warnings)
 
 
 def test_aligning_again_starts_from_the_sfm_frame(room: SurveyedRoom) -> None:
