@@ -33,6 +33,8 @@ _NIBBLE_ZERO = 8
 # with a normal distribution do best with about 0.7.
 _NIBBLE_CLIPS = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4)
 _ROWS_AT_ONCE = 64
+# Squares of numbers about this small are lost in float32.
+_TINY_LENGTH = 1e-15
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,13 @@ def unit_rows(rows: NDArray[np.generic]) -> NDArray[np.float32]:
     """Vectors [K,D] of any kind of number as float32 of length one; zeros stay zeros."""
     vectors = np.asarray(rows, np.float32)
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.maximum(lengths, np.finfo(np.float32).tiny), np.float32)
+    units = np.asarray(vectors / np.maximum(lengths, np.finfo(np.float32).tiny), np.float32)
+    tiny = lengths[:, 0] < _TINY_LENGTH
+    if tiny.any():
+        wide = vectors[tiny].astype(np.float64)
+        wide_lengths = np.linalg.norm(wide, axis=1, keepdims=True)
+        units[tiny] = wide / np.where(wide_lengths > 0.0, wide_lengths, 1.0)
+    return units
 
 
 @dataclass(frozen=True)
