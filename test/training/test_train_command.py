@@ -26,6 +26,7 @@ from gam_relocalizer.training.loop import (
 from gam_relocalizer.training.recipes import recipe
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from tiny_place import TinyPlace
@@ -173,6 +174,15 @@ def test_an_interrupt_ends_the_run_after_a_step_that_can_be_resumed(tmp_path: Pa
     assert resumed.step == trainer.step
 
 
+@pytest.fixture
+def interrupts_raise() -> Iterator[None]:
+    """As in a terminal; a process that a script put into the background ignores them."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures('interrupts_raise')
 def test_a_second_interrupt_ends_the_run_at_once(tmp_path: Path) -> None:
     trainer = Trainer(SMALL, tmp_path)
 
